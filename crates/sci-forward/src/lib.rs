@@ -1,0 +1,1 @@
+//! sci-forward
