@@ -1,0 +1,111 @@
+//! PSNR and both SSIM conventions of the field, per frame, data range 1, in `f64`.
+//!
+//! The paper's code takes scikit-image's defaults ([`ssim`]); the `cacti` family takes the Gaussian window
+//! ([`ssim_gaussian`]). The two give different numbers for the same images, so that their columns cannot be compared.
+
+use ndarray::{Array2, ArrayView2, ArrayView3, Zip};
+
+/// Peak signal-to-noise ratio `10 log10(1 / MSE)` in dB of an image `[H, W]` with data range 1; infinite for equal images.
+///
+/// ```
+/// use ndarray::Array2;
+/// let (a, b) = (Array2::<f32>::zeros((4, 4)), Array2::<f32>::from_elem((4, 4), 0.1));
+/// assert!((sci_forward::metrics::psnr(a.view(), b.view()) - 20.0).abs() < 1e-5);
+/// ```
+///
+/// # Panics
+/// If the sizes differ.
+pub fn psnr(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>) -> f64 {
+    assert_eq!(reference.dim(), image.dim(), "images of one size are compared");
+    let sum = Zip::from(reference).and(image).fold(0.0, |s, &a, &b| s + (f64::from(a) - f64::from(b)).powi(2));
+    -10.0 * (sum / reference.len() as f64).log10()
+}
+
+/// The mean over frames of a metric of two videos `[T, H, W]`.
+///
+/// # Panics
+/// If the numbers of frames differ.
+pub fn mean_over_frames<M>(reference: ArrayView3<'_, f32>, video: ArrayView3<'_, f32>, metric: M) -> f64
+where
+    M: Fn(ArrayView2<'_, f32>, ArrayView2<'_, f32>) -> f64,
+{
+    assert_eq!(reference.dim(), video.dim(), "videos of one size are compared");
+    let sum: f64 = reference.outer_iter().zip(video.outer_iter()).map(|(a, b)| metric(a, b)).sum();
+    sum / reference.dim().0 as f64
+}
+
+/// Structural similarity as scikit-image's default and the paper's code have it: 7×7 uniform window, sample
+/// covariance (N / (N − 1)), K1 = 0.01, K2 = 0.03, 3 border pixels left out. NaN for images under 7×7.
+///
+/// # Panics
+/// If the sizes differ.
+///
+/// # References
+/// Wang et al., *Image quality assessment: from error visibility to structural similarity*, 2004.
+pub fn ssim(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>) -> f64 {
+    ssim_with(reference, image, &[1.0 / 7.0; 7], 49.0 / 48.0)
+}
+
+/// Structural similarity with the original's Gaussian window (11×11, σ = 1.5), population covariance, valid region only.
+/// NaN for images under 11×11.
+///
+/// # Panics
+/// If the sizes differ.
+pub fn ssim_gaussian(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>) -> f64 {
+    let mut taps: [f64; 11] = std::array::from_fn(|i| (-0.5 * ((i as f64 - 5.0) / 1.5).powi(2)).exp());
+    let sum: f64 = taps.iter().sum();
+    taps.iter_mut().for_each(|t| *t /= sum);
+    ssim_with(reference, image, &taps, 1.0)
+}
+
+fn ssim_with(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>, taps: &[f64], covariance_norm: f64) -> f64 {
+    const C1: f64 = 0.01 * 0.01;
+    const C2: f64 = 0.03 * 0.03;
+    assert_eq!(reference.dim(), image.dim(), "images of one size are compared");
+    if reference.nrows() < taps.len() || reference.ncols() < taps.len() {
+        return f64::NAN;
+    }
+    let (a, b) = (reference.mapv(f64::from), image.mapv(f64::from));
+    let filter = |v: Array2<f64>| filter_valid(&v, taps);
+    let (mean_a, mean_b) = (filter(a.clone()), filter(b.clone()));
+    let (aa, bb, ab) = (filter(&a * &a), filter(&b * &b), filter(&a * &b));
+    let sum = Zip::from(&mean_a).and(&mean_b).and(&aa).and(&bb).and(&ab).fold(0.0, |sum, &ma, &mb, &aa, &bb, &ab| {
+        let variance_a = covariance_norm * (aa - ma * ma);
+        let variance_b = covariance_norm * (bb - mb * mb);
+        let covariance = covariance_norm * (ab - ma * mb);
+        sum + (2.0 * ma * mb + C1) * (2.0 * covariance + C2)
+            / ((ma * ma + mb * mb + C1) * (variance_a + variance_b + C2))
+    });
+    sum / mean_a.len() as f64
+}
+
+/// The separable filter `taps ⊗ taps` where it lies inside the image.
+fn filter_valid(image: &Array2<f64>, taps: &[f64]) -> Array2<f64> {
+    let (height, width) = image.dim();
+    let n = taps.len();
+    let rows = Array2::from_shape_fn((height, width + 1 - n), |(i, j)| {
+        (0..n).map(|k| taps[k] * image[[i, j + k]]).sum::<f64>()
+    });
+    Array2::from_shape_fn((height + 1 - n, width + 1 - n), |(i, j)| (0..n).map(|k| taps[k] * rows[[i + k, j]]).sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::uniform;
+
+    #[test]
+    fn equal_images_have_no_error() {
+        let a = uniform((20, 21), 0);
+        assert_eq!(psnr(a.view(), a.view()), f64::INFINITY);
+        assert!((ssim(a.view(), a.view()) - 1.0).abs() < 1e-12);
+        assert!((ssim_gaussian(a.view(), a.view()) - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn an_image_smaller_than_the_window_has_no_ssim() {
+        let a = uniform((6, 30), 0);
+        assert!(ssim(a.view(), a.view()).is_nan());
+        assert!(psnr(a.view(), a.view()).is_infinite());
+    }
+}
