@@ -1,1 +1,39 @@
-//! admm
+//! Plug-and-play solvers for snapshot compressive imaging: one loop ([`run`]), solvers that take any [`Denoiser`]
+//! ([`Gap`], [`Admm`]), and priors that need no network ([`Tv`]).
+//!
+//! A solver never sees ground truth, files, networks or the clock; observers and the stop rule do.
+//!
+//! ```
+//! use admm::{Gap, Plan, Problem, Stage, Start, Tv, run};
+//! use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape, testing::moving_square};
+//!
+//! let shape = VideoShape { frames: 4, height: 32, width: 32 };
+//! let h = MaskOperator::new(MaskStack::random(shape, 0.5, 0)?);
+//! let truth = moving_square(shape);
+//! let y = h.forward(truth.view());
+//!
+//! let mut solver = Gap::accelerated(Tv::new(0.1));
+//! let plan = Plan::new([Stage { sigma: 0.0, iterations: 30 }]);
+//! let outcome = run(&mut solver, &Problem::new(&h, y.view())?, Start::Mean, &plan, &mut ())?;
+//! assert!((outcome.estimate - truth).iter().all(|d| d.abs() < 0.5));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod admm;
+mod gap;
+mod observer;
+mod prior;
+mod problem;
+mod schedule;
+mod solver;
+mod tv;
+
+pub use admm::Admm;
+pub use gap::{Gap, MomentumStart};
+pub use observer::{IterInfo, Observer};
+pub use prior::{DenoiseCx, Denoiser, PerStage};
+pub use problem::{Problem, Start};
+pub use schedule::{Plan, Stage, StopRule};
+pub use sci_forward::BoxError;
+pub use solver::{Outcome, SolveError, Solver, StopReason, run};
+pub use tv::Tv;
