@@ -222,32 +222,50 @@ fn primal_row(plane: &Plane<'_>, r: usize, p0: &[f32], p1: &[f32], out: &mut [f3
 /// Moves the dual of one row, `below` being the next row of the primal (or the row itself at the end, where the gradient is 0).
 #[inline(always)]
 fn dual_row(row: &[f32], below: &[f32], image: &[f32], weight: f32, p0: &mut [f32], p1: &mut [f32]) -> f32 {
-    let mut energy = [0f32; LANES];
-    let scale = TAU / weight;
-    let last = row.len() - 1;
-    let update = |x: usize, right: f32, p0: &mut f32, p1: &mut f32, energy: &mut f32| {
-        let (g0, g1, d) = (below[x] - row[x], right - row[x], row[x] - image[x]);
-        let norm = sqrt(g0 * g0 + g1 * g1);
-        *energy += d * d + weight * norm;
-        let shrink = reciprocal(1.0 + scale * norm);
-        *p0 = (*p0 - TAU * g0) * shrink;
-        *p1 = (*p1 - TAU * g1) * shrink;
-    };
-    let chunks = last / LANES;
-    for chunk in 0..chunks {
-        let start = chunk * LANES;
-        let right: &[f32; LANES] = row[start + 1..][..LANES].try_into().expect("a whole chunk");
-        let p0: &mut [f32; LANES] = (&mut p0[start..][..LANES]).try_into().expect("a whole chunk");
-        let p1: &mut [f32; LANES] = (&mut p1[start..][..LANES]).try_into().expect("a whole chunk");
-        for lane in 0..LANES {
-            update(start + lane, right[lane], &mut p0[lane], &mut p1[lane], &mut energy[lane]);
-        }
+    let mut energy = Lanes::default();
+    let width = row.len();
+    // The last column has no right neighbour, so the last lanes, whole or not, go through padded copies.
+    let whole = (width - 1) / LANES * LANES;
+    let at = |slice: &[f32], x: usize| -> Lanes { slice[x..x + LANES].try_into().expect("whole lanes") };
+    for x in (0..whole).step_by(LANES) {
+        let (mut q0, mut q1) = (at(p0, x), at(p1, x));
+        let primal = Primal { row: at(row, x), right: at(row, x + 1), below: at(below, x), image: at(image, x) };
+        dual_lanes(&primal, weight, &mut q0, &mut q1, &mut energy);
+        p0[x..x + LANES].copy_from_slice(&q0);
+        p1[x..x + LANES].copy_from_slice(&q1);
     }
-    for x in chunks * LANES..=last {
-        let right = row[(x + 1).min(last)];
-        update(x, right, &mut p0[x], &mut p1[x], &mut energy[x % LANES]);
-    }
+    let pad = |slice: &[f32]| -> Lanes { std::array::from_fn(|lane| slice.get(whole + lane).copied().unwrap_or(0.0)) };
+    let right =
+        std::array::from_fn(|lane| if whole + lane < width { row[(whole + lane + 1).min(width - 1)] } else { 0.0 });
+    let primal = Primal { row: pad(row), right, below: pad(below), image: pad(image) };
+    let (mut q0, mut q1) = (pad(p0), pad(p1));
+    dual_lanes(&primal, weight, &mut q0, &mut q1, &mut energy);
+    p0[whole..].copy_from_slice(&q0[..width - whole]);
+    p1[whole..].copy_from_slice(&q1[..width - whole]);
     energy.iter().sum()
+}
+
+type Lanes = [f32; LANES];
+
+struct Primal {
+    row: Lanes,
+    right: Lanes,
+    below: Lanes,
+    image: Lanes,
+}
+
+#[inline(always)]
+fn dual_lanes(primal: &Primal, weight: f32, p0: &mut Lanes, p1: &mut Lanes, energy: &mut Lanes) {
+    let scale = TAU / weight;
+    for lane in 0..LANES {
+        let u = primal.row[lane];
+        let (g0, g1, d) = (primal.below[lane] - u, primal.right[lane] - u, u - primal.image[lane]);
+        let norm = sqrt(g0 * g0 + g1 * g1);
+        energy[lane] += d * d + weight * norm;
+        let shrink = reciprocal(1.0 + scale * norm);
+        p0[lane] = (p0[lane] - TAU * g0) * shrink;
+        p1[lane] = (p1[lane] - TAU * g1) * shrink;
+    }
 }
 
 /// `√s` for `s ≥ 0` by two Newton steps on `1/√s`; `√0` is 0.
