@@ -21,6 +21,7 @@
 
 mod admm;
 mod gap;
+mod lanes;
 mod observer;
 mod prior;
 mod problem;
