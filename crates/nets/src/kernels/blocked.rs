@@ -1,0 +1,315 @@
+//! The layout that the kernels work in: channels in blocks of 16, a border of zeros around every plane.
+
+use super::KernelError;
+use super::simd::{Isa, LANES, Simd, entry};
+
+/// One block of channels at one pixel: a cache line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C, align(64))]
+pub(super) struct Pixel(pub(super) [f32; LANES]);
+
+pub(super) const ZERO: Pixel = Pixel([0.0; LANES]);
+
+/// One image of any number of channels as `[⌈C/16⌉][1 + ⌈H⌉₄ + 1][1 + ⌈W⌉₄ + 1][16]` (`⌈·⌉₄`: up to a multiple of 4).
+///
+/// The border is zero, so that a 3×3 filter, or a Winograd tile of 6×6, never has to look where it is. The lanes beyond
+/// the last channel hold nothing: kernels write zeros there and never read them.
+#[derive(Debug, Clone, Default)]
+pub struct Blocked {
+    channels: usize,
+    height: usize,
+    width: usize,
+    data: Vec<Pixel>,
+}
+
+/// Padded extent: the border and a whole number of Winograd tiles.
+pub(super) fn padded(n: usize) -> usize {
+    n.next_multiple_of(4) + 2
+}
+
+impl Blocked {
+    /// An image of zeros.
+    pub fn zeros(channels: usize, height: usize, width: usize) -> Self {
+        let mut image = Self::default();
+        image.resize(channels, height, width);
+        image
+    }
+
+    /// Takes on another shape; the content is unspecified unless the shape stays. Allocates only when it grows.
+    pub fn resize(&mut self, channels: usize, height: usize, width: usize) {
+        if (channels, height, width) == self.shape() {
+            return;
+        }
+        (self.channels, self.height, self.width) = (channels, height, width);
+        self.data.clear();
+        self.data.resize(self.blocks() * padded(height) * padded(width), ZERO);
+    }
+
+    /// `(channels, height, width)`.
+    pub fn shape(&self) -> (usize, usize, usize) {
+        (self.channels, self.height, self.width)
+    }
+
+    /// Number of channel blocks, `⌈C/16⌉`.
+    pub fn blocks(&self) -> usize {
+        self.channels.div_ceil(LANES)
+    }
+
+    fn first_pixel(&self, block: usize, y: usize) -> usize {
+        assert!(
+            block < self.blocks() && y < self.height,
+            "block {block}, row {y} of {} blocks, {} rows",
+            self.blocks(),
+            self.height
+        );
+        (block * padded(self.height) + y + 1) * padded(self.width) + 1
+    }
+
+    /// Row `y` of a channel block: `[W][16]`.
+    ///
+    /// # Panics
+    /// When there is no such block or row.
+    pub fn row(&self, block: usize, y: usize) -> &[f32] {
+        let first = self.first_pixel(block, y);
+        floats(&self.data[first..first + self.width])
+    }
+
+    /// Row `y` of a channel block, to write: `[W][16]`.
+    ///
+    /// # Panics
+    /// When there is no such block or row.
+    pub fn row_mut(&mut self, block: usize, y: usize) -> &mut [f32] {
+        let first = self.first_pixel(block, y);
+        floats_mut(&mut self.data[first..first + self.width])
+    }
+
+    /// Takes on the shape `(channels, height, width)` and the content of `planes [C,H,W]`.
+    ///
+    /// # Errors
+    /// [`KernelError::Length`] when `planes` is not of that size.
+    pub fn read_planes(
+        &mut self,
+        channels: usize,
+        height: usize,
+        width: usize,
+        planes: &[f32],
+    ) -> Result<(), KernelError> {
+        check_len(channels * height * width, planes.len())?;
+        self.resize(channels, height, width);
+        let isa = Isa::detect()?;
+        let view = self.view_mut();
+        // SAFETY: `planes` has C·H·W floats; the interior of this image is as large; detect() gives what there is.
+        unsafe {
+            pack(isa, planes.as_ptr(), height * width, width, channels, height, width, view.inner());
+        }
+        Ok(())
+    }
+
+    /// Writes the content into `planes [C,H,W]`.
+    ///
+    /// # Errors
+    /// [`KernelError::Length`] when `planes` is not of that size.
+    pub fn write_planes(&self, planes: &mut [f32]) -> Result<(), KernelError> {
+        check_len(self.channels * self.height * self.width, planes.len())?;
+        let isa = Isa::detect()?;
+        // SAFETY: as in `read_planes`.
+        unsafe {
+            unpack(
+                isa,
+                self.view().inner(),
+                self.channels,
+                self.height,
+                self.width,
+                planes.as_mut_ptr(),
+                self.height * self.width,
+                self.width,
+            );
+        }
+        Ok(())
+    }
+
+    pub(super) fn view(&self) -> View {
+        View {
+            ptr: self.data.as_ptr().cast(),
+            block: padded(self.height) * padded(self.width) * LANES,
+            row: padded(self.width) * LANES,
+        }
+    }
+
+    pub(super) fn view_mut(&mut self) -> ViewMut {
+        ViewMut {
+            ptr: self.data.as_mut_ptr().cast(),
+            block: padded(self.height) * padded(self.width) * LANES,
+            row: padded(self.width) * LANES,
+        }
+    }
+}
+
+pub(super) fn check_len(expected: usize, found: usize) -> Result<(), KernelError> {
+    if expected == found { Ok(()) } else { Err(KernelError::Length { expected, found }) }
+}
+
+pub(super) fn floats(pixels: &[Pixel]) -> &[f32] {
+    // SAFETY: a Pixel is 16 floats without padding.
+    unsafe { std::slice::from_raw_parts(pixels.as_ptr().cast(), pixels.len() * LANES) }
+}
+
+pub(super) fn floats_mut(pixels: &mut [Pixel]) -> &mut [f32] {
+    // SAFETY: a Pixel is 16 floats without padding, and any floats make a Pixel.
+    unsafe { std::slice::from_raw_parts_mut(pixels.as_mut_ptr().cast(), pixels.len() * LANES) }
+}
+
+/// Blocked pixels to read: block `b`, row `y`, column `x` at `ptr + b·block + y·row + 16·x`.
+#[derive(Clone, Copy)]
+pub(super) struct View {
+    pub(super) ptr: *const f32,
+    pub(super) block: usize,
+    pub(super) row: usize,
+}
+
+/// Blocked pixels to write.
+#[derive(Clone, Copy)]
+pub(super) struct ViewMut {
+    pub(super) ptr: *mut f32,
+    pub(super) block: usize,
+    pub(super) row: usize,
+}
+
+// SAFETY: views are addresses; what is done through them is the user's concern.
+unsafe impl Send for View {}
+// SAFETY: as above.
+unsafe impl Sync for View {}
+// SAFETY: as above.
+unsafe impl Send for ViewMut {}
+// SAFETY: as above.
+unsafe impl Sync for ViewMut {}
+
+impl View {
+    pub(super) fn down(self, rows: usize) -> Self {
+        Self { ptr: self.ptr.wrapping_add(rows * self.row), ..self }
+    }
+
+    /// Skips the border.
+    pub(super) fn inner(self) -> Self {
+        Self { ptr: self.ptr.wrapping_add(self.row + LANES), ..self }
+    }
+}
+
+impl ViewMut {
+    pub(super) fn down(self, rows: usize) -> Self {
+        Self { ptr: self.ptr.wrapping_add(rows * self.row), ..self }
+    }
+
+    /// Skips the border.
+    pub(super) fn inner(self) -> Self {
+        Self { ptr: self.ptr.wrapping_add(self.row + LANES), ..self }
+    }
+
+    pub(super) fn shared(self) -> View {
+        View { ptr: self.ptr, block: self.block, row: self.row }
+    }
+}
+
+entry!(pub(super) fn pack = pack_rows(
+    planes: *const f32, plane: usize, line: usize, channels: usize, height: usize, width: usize, dst: ViewMut,
+));
+
+/// Planes, `plane` floats apart with lines `line` apart, to blocks.
+#[inline(always)]
+unsafe fn pack_rows<S: Simd>(
+    planes: *const f32,
+    plane: usize,
+    line: usize,
+    channels: usize,
+    height: usize,
+    width: usize,
+    dst: ViewMut,
+) {
+    let mut c = 0;
+    while c < channels {
+        let lanes = (channels - c).min(LANES);
+        let mut y = 0;
+        while y < height {
+            let mut x = 0;
+            while x < width {
+                let pixels = (width - x).min(LANES);
+                // SAFETY: pixels x..x+pixels of row y, channels c..c+lanes are inside on both sides.
+                unsafe {
+                    let src = planes.add(c * plane + y * line + x);
+                    let out = dst.ptr.add(c / LANES * dst.block + y * dst.row + x * LANES);
+                    if lanes == LANES && pixels == LANES {
+                        S::transpose(src, plane, out, LANES);
+                        let mut k = 0;
+                        while k < LANES {
+                            S::prefetch(src.wrapping_add(k * plane + 4 * LANES));
+                            k += 1;
+                        }
+                    } else {
+                        let mut p = 0;
+                        while p < pixels {
+                            S::splat(0.0).store(out.add(p * LANES));
+                            let mut k = 0;
+                            while k < lanes {
+                                *out.add(p * LANES + k) = *src.add(k * plane + p);
+                                k += 1;
+                            }
+                            p += 1;
+                        }
+                    }
+                }
+                x += LANES;
+            }
+            y += 1;
+        }
+        c += LANES;
+    }
+}
+
+entry!(pub(super) fn unpack = unpack_rows(
+    src: View, channels: usize, height: usize, width: usize, planes: *mut f32, plane: usize, line: usize,
+));
+
+/// Blocks to planes, `plane` floats apart with lines `line` apart.
+#[inline(always)]
+unsafe fn unpack_rows<S: Simd>(
+    src: View,
+    channels: usize,
+    height: usize,
+    width: usize,
+    planes: *mut f32,
+    plane: usize,
+    line: usize,
+) {
+    let mut c = 0;
+    while c < channels {
+        let lanes = (channels - c).min(LANES);
+        let mut y = 0;
+        while y < height {
+            let mut x = 0;
+            while x < width {
+                let pixels = (width - x).min(LANES);
+                // SAFETY: pixels x..x+pixels of row y, channels c..c+lanes are inside on both sides.
+                unsafe {
+                    let p = src.ptr.add(c / LANES * src.block + y * src.row + x * LANES);
+                    let out = planes.add(c * plane + y * line + x);
+                    if lanes == LANES && pixels == LANES {
+                        S::transpose(p, LANES, out, plane);
+                    } else {
+                        let mut k = 0;
+                        while k < lanes {
+                            let mut i = 0;
+                            while i < pixels {
+                                *out.add(k * plane + i) = *p.add(i * LANES + k);
+                                i += 1;
+                            }
+                            k += 1;
+                        }
+                    }
+                }
+                x += LANES;
+            }
+            y += 1;
+        }
+        c += LANES;
+    }
+}
