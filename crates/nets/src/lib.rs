@@ -1,3 +1,31 @@
-//! nets
+//! FFDNet, FastDVDnet and DDNet: the learned denoisers and demosaicer of plug-and-play reconstruction, on candle, with
+//! CPU convolution kernels of their own.
+//!
+//! ```
+//! use admm::{DenoiseCx, Denoiser};
+//! use nets::{Ffdnet, FfdnetSpec, Network};
+//! use ndarray::Array4;
+//!
+//! let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0)?;
+//! let noisy = Array4::from_elem((2, 1, 9, 7), 0.5);
+//! let mut clean = Array4::zeros(noisy.dim());
+//! let cx = DenoiseCx { sigma: 25.0 / 255.0, iteration: 0, stage: 0 };
+//! net.denoise(&cx, noisy.view(), clean.view_mut())?;
+//! assert_eq!(net.describe(), "FFDNet (gray, 8 channels, 3 layers)");
+//! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
+//! ```
 
+mod error;
+mod ffdnet;
 pub mod kernels;
+mod layers;
+mod network;
+pub mod weights;
+
+pub use error::{Error, KeyReport};
+pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
+pub use network::Network;
+pub use weights::WeightFile;
+
+/// A result of this crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;

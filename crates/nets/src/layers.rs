@@ -1,0 +1,190 @@
+//! Convolution layers with optional batch norm, and where their tensors come from.
+
+use crate::kernels::{Conv3x3, conv3x3};
+use crate::{Error, KeyReport};
+use candle_core::{Device, Tensor, Var};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// PyTorch's default, which all published weights were trained with.
+const BATCH_NORM_EPSILON: f64 = 1e-5;
+
+/// Batch norm with frozen statistics: `γ (x − mean) / √(var + ε) + β`.
+#[derive(Debug, Clone)]
+struct BatchNorm {
+    name: String,
+    gamma: Tensor,
+    beta: Tensor,
+    mean: Tensor,
+    variance: Tensor,
+}
+
+/// A 3×3 convolution, batch norm, ReLU; the last two and the bias are optional.
+#[derive(Debug, Clone)]
+pub struct Conv {
+    name: String,
+    opts: Conv3x3,
+    weight: Tensor,
+    bias: Option<Tensor>,
+    norm: Option<BatchNorm>,
+}
+
+/// What a [`Conv`] adds to its products.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Shift {
+    Nothing,
+    Bias,
+    /// Batch norm under this name.
+    Norm(String),
+}
+
+impl Conv {
+    pub(crate) fn new(
+        source: &mut Source<'_>,
+        name: String,
+        (inputs, outputs): (usize, usize),
+        opts: Conv3x3,
+        shift: Shift,
+    ) -> Result<Self, Error> {
+        let inputs = inputs / opts.groups;
+        // He initialisation keeps the variance through a ReLU; without one there is no half to make up for.
+        let gain: f64 = if opts.relu { 2.0 } else { 1.0 };
+        let deviation = (gain / (9 * inputs) as f64).sqrt();
+        let weight = source.tensor(format!("{name}.weight"), &[outputs, inputs, 3, 3], Init::Normal(deviation))?;
+        let bias = match shift {
+            Shift::Bias => Some(source.tensor(format!("{name}.bias"), &[outputs], Init::Constant(0.0))?),
+            _ => None,
+        };
+        let norm = match shift {
+            Shift::Norm(name) => Some(BatchNorm {
+                gamma: source.tensor(format!("{name}.weight"), &[outputs], Init::Constant(1.0))?,
+                beta: source.tensor(format!("{name}.bias"), &[outputs], Init::Constant(0.0))?,
+                mean: source.tensor(format!("{name}.running_mean"), &[outputs], Init::Constant(0.0))?,
+                variance: source.tensor(format!("{name}.running_var"), &[outputs], Init::Constant(1.0))?,
+                name,
+            }),
+            _ => None,
+        };
+        Ok(Self { name, opts, weight, bias, norm })
+    }
+
+    pub(crate) fn opts(&self) -> Conv3x3 {
+        self.opts
+    }
+
+    pub(crate) fn device(&self) -> &Device {
+        self.weight.device()
+    }
+
+    /// Weight and bias with the batch norm folded in: `w γ/√(var+ε)`, `β − mean γ/√(var+ε)`; differentiable, so that
+    /// training the affine part costs no pass over the activations.
+    pub(crate) fn folded(&self) -> candle_core::Result<(Tensor, Option<Tensor>)> {
+        let Some(norm) = &self.norm else { return Ok((self.weight.clone(), self.bias.clone())) };
+        let scale = (&norm.gamma / (&norm.variance + BATCH_NORM_EPSILON)?.sqrt()?)?;
+        let weight = self.weight.broadcast_mul(&scale.reshape(((), 1, 1, 1))?)?;
+        let bias = (&norm.beta - (&norm.mean * &scale)?)?;
+        Ok((weight, Some(bias)))
+    }
+
+    pub(crate) fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
+        let (weight, bias) = self.folded()?;
+        conv3x3(x, &weight, bias.as_ref(), self.opts)
+    }
+
+    /// Replaces the batch norm by the equal weight and bias.
+    pub(crate) fn fold(&mut self) -> candle_core::Result<()> {
+        let (weight, bias) = self.folded()?;
+        (self.weight, self.bias, self.norm) = (weight.detach(), bias.map(|b| b.detach()), None);
+        Ok(())
+    }
+
+    /// `(name, tensor, trainable)` of everything in the layer.
+    pub(crate) fn tensors_mut(&mut self) -> Vec<(String, &mut Tensor, bool)> {
+        let mut all = vec![(format!("{}.weight", self.name), &mut self.weight, true)];
+        if let Some(bias) = &mut self.bias {
+            all.push((format!("{}.bias", self.name), bias, true));
+        }
+        if let Some(norm) = &mut self.norm {
+            let name = |key| format!("{}.{key}", norm.name);
+            all.extend([
+                (name("weight"), &mut norm.gamma, true),
+                (name("bias"), &mut norm.beta, true),
+                (name("running_mean"), &mut norm.mean, false),
+                (name("running_var"), &mut norm.variance, false),
+            ]);
+        }
+        all
+    }
+
+    /// Makes the trainable tensors variables, and returns them.
+    pub(crate) fn make_trainable(&mut self) -> candle_core::Result<Vec<(String, Var)>> {
+        let mut vars = Vec::new();
+        for (name, tensor, trainable) in self.tensors_mut() {
+            if trainable {
+                let var = Var::from_tensor(tensor)?;
+                *tensor = var.as_tensor().clone();
+                vars.push((name, var));
+            }
+        }
+        Ok(vars)
+    }
+}
+
+/// How a tensor starts when it is not loaded.
+#[derive(Debug, Clone, Copy)]
+enum Init {
+    Normal(f64),
+    Constant(f32),
+}
+
+/// Where a network's tensors come from. One pass over the architecture either loads it or initialises it.
+pub(crate) enum Source<'a> {
+    /// A file's tensors; differences are collected, and reported together by [`Source::finish`].
+    Stored { tensors: BTreeMap<String, Tensor>, report: KeyReport },
+    /// He initialisation. candle's CPU generator cannot be seeded; this one is.
+    Random(&'a mut ChaCha8Rng),
+}
+
+impl Source<'_> {
+    pub(crate) fn stored(tensors: BTreeMap<String, Tensor>) -> Self {
+        Self::Stored { tensors, report: KeyReport::default() }
+    }
+
+    fn tensor(&mut self, name: String, shape: &[usize], init: Init) -> Result<Tensor, Error> {
+        match self {
+            Self::Random(rng) => {
+                let count = shape.iter().product();
+                let values = match init {
+                    Init::Constant(value) => vec![value; count],
+                    Init::Normal(deviation) => {
+                        let normal = |_| (deviation * Distribution::<f64>::sample(&StandardNormal, *rng)) as f32;
+                        (0..count).map(normal).collect()
+                    }
+                };
+                Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
+            }
+            Self::Stored { tensors, report } => {
+                match tensors.remove(&name) {
+                    Some(tensor) if tensor.dims() == shape => return Ok(tensor),
+                    Some(tensor) => report.mismatched.push((name, shape.to_vec(), tensor.dims().to_vec())),
+                    None => report.missing.push(name),
+                }
+                // A placeholder: `finish` will refuse the whole.
+                Ok(Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu)?)
+            }
+        }
+    }
+
+    /// Refuses tensors that were missing, of another shape, or left over.
+    pub(crate) fn finish(self, path: &Path, network: &str) -> Result<(), Error> {
+        let Self::Stored { tensors, mut report } = self else { return Ok(()) };
+        report.unexpected = tensors.into_keys().filter(|name| !name.ends_with("num_batches_tracked")).collect();
+        if report.is_empty() {
+            Ok(())
+        } else {
+            Err(Error::Keys { path: path.to_owned(), network: network.to_owned(), keys: report })
+        }
+    }
+}

@@ -1,0 +1,18 @@
+//! Weights that ship inside the crate: one line here for each file in `crates/nets/weights/`.
+
+use crate::{Error, Result};
+
+const BUNDLED: &[(&str, &[u8])] = &[];
+
+/// The names that `bundled:NAME` knows.
+pub fn bundled_names() -> Vec<&'static str> {
+    BUNDLED.iter().map(|(name, _)| *name).collect()
+}
+
+pub(super) fn bytes(name: &str) -> Result<&'static [u8]> {
+    BUNDLED
+        .iter()
+        .find(|(known, _)| *known == name)
+        .map(|(_, bytes)| *bytes)
+        .ok_or_else(|| Error::UnknownBundled { name: name.to_owned(), known: bundled_names() })
+}

@@ -1,0 +1,184 @@
+//! Weight files: published `.pth`, `.safetensors`, and those bundled with the crate.
+//!
+//! A file becomes named f32 tensors; a network takes them only when the names and shapes are exactly its own.
+
+mod bundled;
+mod pth;
+
+use crate::{Error, FfdnetSpec, Result};
+use candle_core::{DType, Device, Tensor};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub use bundled::bundled_names;
+
+/// The network that a set of tensors belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Architecture {
+    /// FFDNet, gray or color.
+    Ffdnet(FfdnetSpec),
+}
+
+impl std::fmt::Display for Architecture {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Ffdnet(spec) => spec.fmt(f),
+        }
+    }
+}
+
+/// One tensor of a weight file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TensorSummary {
+    /// Its name, without a leading `module.`.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its type in the file, such as `F32`.
+    pub dtype: String,
+}
+
+/// The tensors of a weight file, as f32, by name; a leading `module.` (PyTorch's data-parallel wrapper) is stripped.
+#[derive(Debug, Clone)]
+pub struct WeightFile {
+    path: PathBuf,
+    tensors: BTreeMap<String, Tensor>,
+    stored: BTreeMap<String, DType>,
+}
+
+impl WeightFile {
+    /// Reads a file, or bundled weights when the path is `bundled:NAME`. The format is told by the contents.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is cut short, or holds a weight that is not finite.
+    pub fn read(path: &Path) -> Result<Self> {
+        if let Some(name) = path.to_str().and_then(|p| p.strip_prefix("bundled:")) {
+            return Self::parse(path, bundled::bytes(name)?);
+        }
+        let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        Self::parse(path, &bytes)
+    }
+
+    /// Reads the bytes of a file; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`WeightFile::read`].
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        let stored = if pth::looks_like(bytes) {
+            pth::read(bytes).map_err(|reason| Error::format(path, reason))?
+        } else {
+            candle_core::safetensors::load_buffer(bytes, &Device::Cpu)
+                .map_err(|e| Error::format(path, format!("neither a .pth nor a whole .safetensors file: {e}")))?
+                .into_iter()
+                .collect()
+        };
+        Self::from_stored(path, stored)
+    }
+
+    fn from_stored(path: &Path, stored: BTreeMap<String, Tensor>) -> Result<Self> {
+        let mut file = Self { path: path.to_owned(), tensors: BTreeMap::new(), stored: BTreeMap::new() };
+        for (name, tensor) in stored {
+            let name = name.strip_prefix("module.").unwrap_or(&name).to_owned();
+            let dtype = tensor.dtype();
+            file.stored.insert(name.clone(), dtype);
+            if name.ends_with("num_batches_tracked") {
+                continue;
+            }
+            if !matches!(dtype, DType::F16 | DType::BF16 | DType::F32 | DType::F64) {
+                return Err(Error::DType { path: path.to_owned(), key: name, dtype });
+            }
+            let tensor = tensor.to_dtype(DType::F32)?.contiguous()?;
+            if let Some(value) = tensor.flatten_all()?.to_vec1::<f32>()?.into_iter().find(|v| !v.is_finite()) {
+                return Err(Error::NotFinite { path: path.to_owned(), key: name, value });
+            }
+            file.tensors.insert(name, tensor);
+        }
+        Ok(file)
+    }
+
+    /// Where it came from.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The network that the tensors belong to, told by their names and shapes. That all are there is checked by the
+    /// network's `from_weights`.
+    ///
+    /// # Errors
+    /// [`Error::UnknownArchitecture`].
+    pub fn architecture(&self) -> Result<Architecture> {
+        FfdnetSpec::recognise(self).map(Architecture::Ffdnet).ok_or_else(|| Error::UnknownArchitecture {
+            path: self.path.clone(),
+            found: self.tensors.keys().cloned().collect(),
+        })
+    }
+
+    /// Name, shape and stored type of every tensor.
+    pub fn summary(&self) -> Vec<TensorSummary> {
+        let one = |(name, tensor): (&String, &Tensor)| TensorSummary {
+            name: name.clone(),
+            shape: tensor.dims().to_vec(),
+            dtype: format!("{:?}", self.stored[name]),
+        };
+        self.tensors.iter().map(one).collect()
+    }
+
+    /// Number of values in all tensors, batch norm statistics included.
+    pub fn value_count(&self) -> usize {
+        self.tensors.values().map(Tensor::elem_count).sum()
+    }
+
+    /// The tensors.
+    pub fn into_tensors(self) -> BTreeMap<String, Tensor> {
+        self.tensors
+    }
+
+    pub(crate) fn shapes(&self) -> impl Iterator<Item = (&str, &[usize])> {
+        self.tensors.iter().map(|(name, tensor)| (name.as_str(), tensor.dims()))
+    }
+
+    pub(crate) fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.tensors.get(name).map(Tensor::dims)
+    }
+}
+
+/// How [`write_safetensors`] stores numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Storage {
+    /// 4 bytes a weight, exact.
+    #[default]
+    F32,
+    /// 2 bytes a weight; relative error up to 2⁻¹¹. For files that must be small.
+    F16,
+}
+
+/// Writes tensors to a `.safetensors` file: to a temporary name first, so that the file is never half-written.
+///
+/// # Errors
+/// [`Error::Write`].
+pub fn write_safetensors(path: &Path, tensors: &BTreeMap<String, Tensor>, storage: Storage) -> Result<()> {
+    let dtype = match storage {
+        Storage::F32 => DType::F32,
+        Storage::F16 => DType::F16,
+    };
+    let tensors =
+        tensors.iter().map(|(name, t)| Ok((name.as_str(), t.to_dtype(dtype)?))).collect::<Result<Vec<_>>>()?;
+    let bytes = safetensors::serialize(tensors, None).map_err(|e| Error::format(path, e.to_string()))?;
+    write_atomically(path, &bytes)
+}
+
+/// Writes to a temporary name beside `path`, then renames.
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    let fail = |source| Error::Write { path: path.to_owned(), source };
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".tmp");
+    let temporary = path.with_file_name(name);
+    let write = || {
+        let mut file = std::fs::File::create(&temporary)?;
+        std::io::Write::write_all(&mut file, bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&temporary, path)
+    };
+    write().map_err(fail)
+}
