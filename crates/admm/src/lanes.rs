@@ -28,6 +28,53 @@ pub(crate) trait Lanes: Copy {
 
 /// The widest vector.
 pub(crate) const MAX_LANES: usize = 32;
+
+/// One number at a time, for rows that are narrower than a vector.
+// SAFETY (of every block below): the trait's contract gives the memory.
+#[allow(clippy::undocumented_unsafe_blocks)]
+impl Lanes for f32 {
+    const N: usize = 1;
+    #[inline(always)]
+    unsafe fn splat(v: f32) -> Self {
+        v
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> Self {
+        unsafe { *p }
+    }
+    #[inline(always)]
+    unsafe fn store(self, p: *mut f32) {
+        unsafe { *p = self }
+    }
+    #[inline(always)]
+    unsafe fn add(self, o: Self) -> Self {
+        self + o
+    }
+    #[inline(always)]
+    unsafe fn sub(self, o: Self) -> Self {
+        self - o
+    }
+    #[inline(always)]
+    unsafe fn mul(self, o: Self) -> Self {
+        self * o
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, a: Self, b: Self) -> Self {
+        self * a + b
+    }
+    #[inline(always)]
+    unsafe fn neg_mul_add(self, a: Self, b: Self) -> Self {
+        b - self * a
+    }
+    #[inline(always)]
+    unsafe fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+    #[inline(always)]
+    unsafe fn recip(self) -> Self {
+        1.0 / self
+    }
+}
 /// Below it `1/√` would leave the range of `f32`.
 const TINY: f32 = 1e-30;
 
@@ -228,6 +275,7 @@ mod tests {
 
     #[test]
     fn estimates_reach_the_stated_errors() {
+        check(errors::<f32>());
         check(errors::<Portable>());
         #[cfg(target_arch = "x86_64")]
         {

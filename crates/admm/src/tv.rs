@@ -1,7 +1,8 @@
 //! Total variation by Chambolle's dual projection, frame by frame.
 //!
-//! One inner iteration is one pass over the frame: the primal row below is made from the duals just before the row
-//! above it is updated, so that nothing but the two duals is kept. A frame and its duals (1 MB at 256×256) stay in L2.
+//! The dual steps of a call run as one sweep over the frame: as soon as a step has made row `r` of its primal, the next
+//! step works on the row above. Each step keeps two rows of its dual and of its primal, so that the whole computation stays
+//! in cache, the frame is read once and written once, and no dual plane exists.
 
 #[cfg(target_arch = "x86_64")]
 use crate::lanes::{Avx2, Avx512};
@@ -13,19 +14,21 @@ use rayon::slice::ParallelSliceMut;
 
 /// Dual step, 1 / (2 · dimensions).
 const TAU: f32 = 0.25;
+/// The steps end once the energy changes by less than this part of its first value.
+const ENERGY_TOLERANCE: f64 = 2e-4;
 
 /// Isotropic total variation of every frame and channel on its own: `argmin_u ½‖u − x‖² + weight · Σ |∇u|`,
-/// by `inner` steps of Chambolle's dual projection. σ is ignored: the strength is `weight`.
+/// by a few steps of Chambolle's dual projection. σ is ignored: the strength is `weight`.
 ///
 /// | Parameter | Default | Purpose | Range |
 /// |---|---|---|---|
 /// | `weight` | – | strength | > 0, finite |
-/// | [`inner`](Tv::inner) | 5 | dual steps a call | ≥ 1 |
+/// | [`inner`](Tv::inner) | 5 | iterations a call, the last of which only forms the output | ≥ 1 |
 /// | [`warm_dual`](Tv::warm_dual) | off | start from the last call's dual instead of 0 | |
 ///
 /// With the defaults it is scikit-image's `denoise_tv_chambolle(frame, weight, max_num_iter=5)`, which is what the
-/// reference codes call: out of 5 steps the last only forms the output, and a step is the last one
-/// as soon as the energy changes by less than 2e-4 of its first value.
+/// reference codes call, with its early end: the iterations stop as soon as the energy changes by less than 2e-4 of its
+/// first value.
 ///
 /// # References
 /// Chambolle, *An algorithm for total variation minimization and applications*, 2004.
@@ -34,21 +37,32 @@ pub struct Tv {
     weight: f32,
     inner: usize,
     warm_dual: bool,
-    kernel: Kernel,
-    duals: Vec<Dual>,
+    sweep: Sweep,
+    scratch: Vec<Scratch>,
+    fields: Vec<Field>,
 }
 
-/// The dual field of one plane.
+/// What one thread needs to denoise a plane: the steps in flight, and where strided rows are packed.
 #[derive(Debug, Clone, Default)]
-struct Dual {
-    size: (usize, usize),
-    p0: Vec<f32>,
-    p1: Vec<f32>,
-    /// Whether the field holds the last call's dual.
-    warm: bool,
-    /// Where the output is made if the caller's is strided.
-    strided: Vec<f32>,
+struct Scratch {
+    levels: Vec<Level>,
+    packed: Vec<f32>,
 }
+
+/// The two newest rows, row `r` at index `r % 2`, of the dual that a step starts from and of the primal that it makes.
+/// A row of the primal ends with its last number once more, the right neighbour of the last column; a row of the dual begins
+/// with a zero, the left neighbour of the first.
+#[derive(Debug, Clone, Default)]
+struct Level {
+    dual: [Rows; 2],
+    primal: [Vec<f32>; 2],
+    energy: f64,
+}
+
+/// The two components of the dual, one row or one plane of each.
+type Rows = [Vec<f32>; 2];
+/// The dual of a plane that is kept from call to call; empty before the first.
+type Field = Rows;
 
 impl Tv {
     /// TV of this weight.
@@ -57,19 +71,19 @@ impl Tv {
     /// If the weight is not positive and finite.
     pub fn new(weight: f32) -> Self {
         assert!(weight > 0.0 && weight.is_finite(), "TV weight {weight} must be finite and greater than 0");
-        let kernel = Kernel::available()[0];
-        Self { weight, inner: 5, warm_dual: false, kernel, duals: Vec::new() }
+        let sweep = Sweep::available()[0];
+        Self { weight, inner: 5, warm_dual: false, sweep, scratch: Vec::new(), fields: Vec::new() }
     }
 
-    /// Dual steps a call, at least 1.
+    /// Iterations a call, at least 1.
     #[must_use]
-    pub fn inner(mut self, steps: usize) -> Self {
-        self.inner = steps.max(1);
+    pub fn inner(mut self, iterations: usize) -> Self {
+        self.inner = iterations.max(1);
         self
     }
 
-    /// Starts each call from the dual field of the call before: inside a solver, where the input changes little from
-    /// call to call, a few steps then do the work of many.
+    /// Starts each call from the dual field of the call before, and never ends it early: inside a solver, where the input
+    /// changes little from call to call, a few iterations then do the work of many.
     #[must_use]
     pub fn warm_dual(mut self, on: bool) -> Self {
         self.warm_dual = on;
@@ -89,22 +103,27 @@ impl Denoiser for Tv {
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         let (frames, channels, height, width) = noisy.dim();
-        // A dual that is kept belongs to its frame; one that is not stays in the cache of the thread that works on it.
-        let groups = if self.warm_dual { frames } else { frames.min(rayon::current_num_threads()) }.max(1);
-        let group = frames.div_ceil(groups).max(1);
-        let kept = if self.warm_dual { channels } else { 1 };
-        self.duals.resize_with(groups * kept, Dual::default);
-        let Self { weight, inner, warm_dual, kernel, .. } = *self;
+        if noisy.is_empty() {
+            return Ok(());
+        }
+        // One scratch a thread; which thread takes which frames does not matter to the result.
+        let group = frames.div_ceil(rayon::current_num_threads());
+        self.scratch.resize_with(frames.div_ceil(group), Scratch::default);
+        self.fields.resize_with(frames * channels, Field::default);
+        let field_size = if self.warm_dual { height * width } else { 0 };
+        let sweep = if width < self.sweep.lanes { Sweep::SCALAR } else { self.sweep };
+        let call = Call { width, weight: self.weight, inner: self.inner, sweep };
         out.axis_chunks_iter_mut(Axis(0), group)
             .into_par_iter()
             .zip(noisy.axis_chunks_iter(Axis(0), group))
-            .zip(self.duals.par_chunks_mut(kept.max(1)))
-            .for_each(|((mut out, noisy), duals)| {
+            .zip(&mut self.scratch)
+            .zip(self.fields.par_chunks_mut(group * channels))
+            .for_each(|(((mut out, noisy), scratch), fields)| {
+                let mut fields = fields.iter_mut();
                 for (mut out, noisy) in out.outer_iter_mut().zip(noisy.outer_iter()) {
-                    for (c, (out, noisy)) in out.outer_iter_mut().zip(noisy.outer_iter()).enumerate() {
-                        let dual = &mut duals[c % kept];
-                        dual.prepare((height, width), warm_dual);
-                        dual.denoise(weight, inner, kernel, noisy, out);
+                    for ((out, noisy), field) in out.outer_iter_mut().zip(noisy.outer_iter()).zip(&mut fields) {
+                        field.iter_mut().filter(|p| p.len() != field_size).for_each(|p| *p = vec![0.0; field_size]);
+                        scratch.denoise(&call, noisy, out, field);
                     }
                 }
             });
@@ -112,256 +131,266 @@ impl Denoiser for Tv {
     }
 }
 
-impl Dual {
-    fn prepare(&mut self, size: (usize, usize), warm: bool) {
-        if self.size != size {
-            let zeros = vec![0.0; size.0 * size.1];
-            *self = Self { size, p0: zeros.clone(), p1: zeros, warm: false, strided: Vec::new() };
-        }
-        self.warm &= warm;
-    }
+/// What a call has in common for all planes.
+#[derive(Clone, Copy)]
+struct Call {
+    width: usize,
+    weight: f32,
+    inner: usize,
+    sweep: Sweep,
+}
 
-    fn denoise(
-        &mut self,
-        weight: f32,
-        inner: usize,
-        kernel: Kernel,
-        image: ArrayView2<'_, f32>,
-        mut out: ArrayViewMut2<'_, f32>,
-    ) {
-        // The sub-lattices of a mosaic come as strided views; the kernel works on rows in memory order.
+impl Scratch {
+    fn denoise(&mut self, call: &Call, image: ArrayView2<'_, f32>, mut out: ArrayViewMut2<'_, f32>, field: &mut Field) {
+        // The sub-lattices of a mosaic come as strided views; the sweep works on rows in memory order.
         let image = image.as_standard_layout();
         let image = image.as_slice().expect("a standard layout is a slice");
         match out.as_slice_mut() {
-            Some(out) => self.denoise_plane(weight, inner, kernel, image, out),
+            Some(out) => self.denoise_plane(call, image, out, field),
             None => {
-                let mut plane = std::mem::take(&mut self.strided);
-                plane.resize(image.len(), 0.0);
-                self.denoise_plane(weight, inner, kernel, image, &mut plane);
-                out.iter_mut().zip(&plane).for_each(|(out, v)| *out = *v);
-                self.strided = plane;
+                let mut packed = std::mem::take(&mut self.packed);
+                packed.resize(image.len(), 0.0);
+                self.denoise_plane(call, image, &mut packed, field);
+                out.iter_mut().zip(&packed).for_each(|(out, v)| *out = *v);
+                self.packed = packed;
             }
         }
     }
 
-    fn denoise_plane(&mut self, weight: f32, inner: usize, kernel: Kernel, image: &[f32], out: &mut [f32]) {
-        let pixels = image.len().max(1) as f64;
-        let (mut first, mut previous) = (0.0, 0.0);
-        for step in 0..inner - 1 {
-            let plane = Plane { image, width: self.size.1, weight, fresh: !self.warm };
-            // SAFETY: `Kernel::available` has checked the instruction set.
-            let energy = unsafe { (kernel.dual_step)(&plane, &mut self.p0, &mut self.p1, out) } / pixels;
-            self.warm = true;
-            if step == 0 {
-                first = energy;
-            } else if (previous - energy).abs() < 2e-4 * first {
-                return;
-            }
-            previous = energy;
+    fn denoise_plane(&mut self, call: &Call, image: &[f32], out: &mut [f32], field: &mut Field) {
+        let mut steps = call.inner - 1;
+        self.run(call, steps, image, out, field);
+        // The energies are known when the sweep is over. If the steps should have ended early, fewer are swept again:
+        // on a video that is still noisy this does not happen.
+        if field[0].is_empty()
+            && let Some(early) = self.early_end(steps)
+        {
+            steps = early;
+            self.run(call, steps, image, out, field);
         }
-        let plane = Plane { image, width: self.size.1, weight, fresh: !self.warm };
-        // SAFETY: `Kernel::available` has checked the instruction set.
-        unsafe { (kernel.primal_step)(&plane, &self.p0, &self.p1, out) }
+    }
+
+    fn run(&mut self, call: &Call, steps: usize, image: &[f32], out: &mut [f32], field: &mut Field) {
+        let rows = |length| [vec![0.0; length], vec![0.0; length]];
+        let level =
+            || Level { dual: [rows(call.width + 1), rows(call.width + 1)], primal: rows(call.width + 1), energy: 0.0 };
+        if self.levels.first().is_some_and(|level| level.dual[0][0].len() != call.width + 1) {
+            self.levels.clear();
+        }
+        self.levels.resize_with(steps + 1, level);
+        // SAFETY: `Sweep::available` has checked the instruction set; rows have at least a vector's width.
+        unsafe { (call.sweep.run)(&mut self.levels, image, call.weight, field, out) }
+    }
+
+    /// The number of steps after which the energy had settled, if that is less than `steps`.
+    fn early_end(&self, steps: usize) -> Option<usize> {
+        let energy = |s: usize| self.levels[s].energy;
+        (1..steps).find(|&s| (energy(s - 1) - energy(s)).abs() < ENERGY_TOLERANCE * energy(0))
     }
 }
 
-struct Plane<'a> {
-    image: &'a [f32],
-    width: usize,
-    weight: f32,
-    /// The dual is 0, whatever its arrays hold.
-    fresh: bool,
+/// [`sweep`] compiled for one instruction set.
+#[derive(Debug, Clone, Copy)]
+struct Sweep {
+    run: unsafe fn(&mut [Level], &[f32], f32, &mut Field, &mut [f32]),
+    /// The narrowest row that it can take.
+    lanes: usize,
 }
 
-/// Writes `out = image + div p`, then moves the dual: `p ← (p − τ ∇out) / (1 + τ / weight · |∇out|)`.
-/// Returns the energy `Σ (out − image)² + weight · Σ |∇out|`.
+macro_rules! compiled {
+    ($lanes:ty $(, $features:literal)?) => {{
+        $(#[target_feature(enable = $features)])?
+        unsafe fn compiled(levels: &mut [Level], image: &[f32], weight: f32, field: &mut Field, out: &mut [f32]) {
+            // SAFETY: the caller's; the features are those of the vector.
+            unsafe { sweep::<$lanes>(levels, image, weight, field, out) }
+        }
+        Sweep { run: compiled, lanes: <$lanes as Lanes>::N }
+    }};
+}
+
+impl Sweep {
+    const SCALAR: Self = compiled!(f32);
+
+    /// Those that this machine can run, the fastest first.
+    fn available() -> Vec<Self> {
+        let mut sweeps = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            if is_x86_feature_detected!("avx512f") {
+                sweeps.push(compiled!(Avx512, "avx512f"));
+            }
+            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                sweeps.push(compiled!(Avx2, "avx2,fma"));
+            }
+        }
+        // On AArch64 it compiles to NEON, which is always there.
+        sweeps.push(compiled!(Portable));
+        sweeps
+    }
+}
+
+/// All steps of one call on one plane. With `u_s = image + div p_s`, level `s` makes row `r` of
+///
+/// ```text
+/// p_{s+1} = (p_s − τ ∇u_s) / (1 + τ / weight · |∇u_s|)
+/// ```
+///
+/// one row after level `s − 1`, and the last level writes `out = u`. `p_0` is 0, or `field` if that is not empty, which
+/// then receives the last dual. Each level's energy is `Σ (u_s − image)² + weight · Σ |∇u_s|`.
 ///
 /// # Safety
-/// The instruction set of `L` must be there.
+/// The instruction set of `L` must be there, and rows must have at least `L::N` columns.
 #[inline(always)]
-unsafe fn dual_step<L: Lanes>(plane: &Plane<'_>, p0: &mut [f32], p1: &mut [f32], out: &mut [f32]) -> f64 {
-    let Plane { image, width, weight, fresh } = *plane;
-    let height = image.len() / width.max(1);
-    let mut energy = 0f64;
-    for r in 0..height {
-        let here = r * width..(r + 1) * width;
-        // SAFETY: the caller's, for all three calls.
+unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, field: &mut Field, out: &mut [f32]) {
+    let width = levels[0].dual[0][0].len() - 1;
+    let (height, last) = (image.len() / width, levels.len() - 1);
+    let warm = !field[0].is_empty();
+    for level in levels.iter_mut() {
+        level.energy = 0.0;
+    }
+    for front in 0..=height + last {
+        for s in 0..=last.min(front) {
+            let r = front - s;
+            if r > height {
+                continue;
+            }
+            let (done, rest) = levels.split_at_mut(s + 1);
+            let level = &mut done[s];
+            let row_of = |r: usize| r * width..(r + 1) * width;
+            if s == 0 && warm && r < height {
+                for (row, plane) in level.dual[r % 2].iter_mut().zip(field.iter()) {
+                    row[1..].copy_from_slice(&plane[row_of(r)]);
+                }
+            }
+            let is_zero = s == 0 && !warm;
+            if r < height {
+                let primal = if s == last { &mut out[row_of(r)] } else { &mut level.primal[r % 2][..width] };
+                if is_zero {
+                    primal.copy_from_slice(&image[row_of(r)]);
+                } else {
+                    let above = if r > 0 { Some(&level.dual[(r - 1) % 2][0][..]) } else { None };
+                    // SAFETY: the caller's.
+                    unsafe { primal_row::<L>(&image[row_of(r)], &level.dual[r % 2], above, primal) }
+                }
+                level.primal[r % 2][width] = level.primal[r % 2][width - 1];
+            }
+            if s < last && r > 0 {
+                // The row above now has its lower neighbour; the last row has none, and no gradient down.
+                let up = (r - 1) % 2;
+                let Level { dual, primal, energy } = level;
+                let below = if r < height { &primal[r % 2] } else { &primal[up] };
+                let from = if is_zero { None } else { Some(&dual[up]) };
+                let to = &mut rest[0].dual[up];
+                // SAFETY: the caller's.
+                let sum = unsafe { dual_row::<L>(&primal[up], below, &image[row_of(r - 1)], weight, from, to) };
+                *energy += f64::from(sum);
+                if warm && s + 1 == last {
+                    for (row, plane) in to.iter().zip(field.iter_mut()) {
+                        plane[row_of(r - 1)].copy_from_slice(&row[1..]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A row of `image + div p`, where `(div p)[r, x] = p0[r−1, x] − p0[r, x] + p1[r, x−1] − p1[r, x]`.
+///
+/// # Safety
+/// The instruction set of `L` must be there, and the row must have at least `L::N` columns.
+#[inline(always)]
+unsafe fn primal_row<L: Lanes>(image: &[f32], [p0, p1]: &Rows, above: Option<&[f32]>, out: &mut [f32]) {
+    let width = image.len();
+    let dual_width = width + 1;
+    assert!(out.len() == width && p0.len() == dual_width && p1.len() == dual_width && width >= L::N);
+    assert!(above.is_none_or(|p| p.len() == dual_width));
+    let mut x = 0;
+    while x < width {
+        // The last vector reaches back over the one before if the width asks for it, and makes the same again.
+        x = x.min(width - L::N);
+        // SAFETY: `x + N ≤ width`, and rows of the dual are one longer; the instruction set is the caller's.
         unsafe {
-            if r == 0 {
-                primal_row::<L>(plane, 0, p0, p1, out);
-            }
-            // The row below is made from p0 of this row, so it comes before this row's update.
-            let last = r + 1 == height;
-            if !last {
-                primal_row::<L>(plane, r + 1, p0, p1, out);
-            }
-            let (row, below) = out[here.start..].split_at(width);
-            let below = if last { row } else { &below[..width] };
-            let (p0, p1) = (&mut p0[here.clone()], &mut p1[here.clone()]);
-            if fresh {
-                p0.fill(0.0);
-                p1.fill(0.0);
-            }
-            energy += f64::from(dual_row::<L>(row, below, &image[here], weight, p0, p1));
-        }
-    }
-    energy
-}
-
-/// Writes `out = image + div p`.
-///
-/// # Safety
-/// The instruction set of `L` must be there.
-#[inline(always)]
-unsafe fn primal_step<L: Lanes>(plane: &Plane<'_>, p0: &[f32], p1: &[f32], out: &mut [f32]) {
-    for r in 0..plane.image.len() / plane.width.max(1) {
-        // SAFETY: the caller's.
-        unsafe { primal_row::<L>(plane, r, p0, p1, out) }
-    }
-}
-
-/// Row `r` of `image + div p`, where `(div p)[r, x] = p0[r−1, x] − p0[r, x] + p1[r, x−1] − p1[r, x]`.
-///
-/// # Safety
-/// The instruction set of `L` must be there.
-#[inline(always)]
-unsafe fn primal_row<L: Lanes>(plane: &Plane<'_>, r: usize, p0: &[f32], p1: &[f32], out: &mut [f32]) {
-    let Plane { image, width, fresh, .. } = *plane;
-    let here = r * width..(r + 1) * width;
-    let (image, out) = (&image[here.clone()], &mut out[here.clone()]);
-    if fresh {
-        out.copy_from_slice(image);
-        return;
-    }
-    let above = if r > 0 { Some(&p0[here.start - width..here.start]) } else { None };
-    let (p0, p1) = (&p0[here.clone()], &p1[here]);
-    let at = |x: usize| {
-        let up = if let Some(above) = above { above[x] } else { 0.0 };
-        image[x] - p0[x] - p1[x] + up + if x > 0 { p1[x - 1] } else { 0.0 }
-    };
-    out[0] = at(0);
-    let mut x = 1;
-    while x + L::N <= width {
-        // SAFETY: `x ≥ 1` and `x + N ≤ width`, the length of every row; the instruction set is the caller's.
-        unsafe {
-            let load = |row: &[f32], x: usize| L::load(row.as_ptr().add(x));
-            let mut sum = load(image, x).sub(load(p0, x)).sub(load(p1, x));
+            let mut sum = L::load(image.as_ptr().add(x)).sub(L::load(p0.as_ptr().add(x + 1)));
+            sum = sum.sub(L::load(p1.as_ptr().add(x + 1)));
             if let Some(above) = above {
-                sum = sum.add(load(above, x));
+                sum = sum.add(L::load(above.as_ptr().add(x + 1)));
             }
-            sum.add(load(p1, x - 1)).store(out.as_mut_ptr().add(x));
+            sum.add(L::load(p1.as_ptr().add(x))).store(out.as_mut_ptr().add(x));
         }
         x += L::N;
     }
-    while x < width {
-        out[x] = at(x);
-        x += 1;
-    }
 }
 
-/// Moves the dual of one row, `below` being the next row of the primal (or the row itself at the end, where the gradient is 0).
+/// The dual step of one row, `below` being the next row of the primal (or the row itself at the end), from the dual
+/// `from` (0 if there is none). Returns the energy of the row.
 ///
 /// # Safety
-/// The instruction set of `L` must be there.
+/// The instruction set of `L` must be there, and the row must have at least `L::N` columns.
 #[inline(always)]
 unsafe fn dual_row<L: Lanes>(
     row: &[f32],
     below: &[f32],
     image: &[f32],
     weight: f32,
-    p0: &mut [f32],
-    p1: &mut [f32],
+    from: Option<&Rows>,
+    to: &mut Rows,
 ) -> f32 {
-    let width = row.len();
-    assert!(below.len() == width && image.len() == width && p0.len() == width && p1.len() == width);
-    // SAFETY: every pointer has N floats: in the rows up to the last N columns but one, in padded copies after that.
-    // The instruction set is the caller's.
+    let width = image.len();
+    let longer = width + 1;
+    assert!(row.len() == longer && below.len() == longer && to.iter().all(|p| p.len() == longer) && width >= L::N);
+    assert!(from.is_none_or(|p| p.iter().all(|p| p.len() == longer)));
+    // SAFETY: `x + N ≤ width` for every vector, and all rows but the image's are one longer. The instruction set is the caller's.
     unsafe {
         let mut energy = L::splat(0.0);
+        let whole = width / L::N * L::N;
         let mut x = 0;
-        while x + L::N < width {
-            let primal = [row.as_ptr().add(x), row.as_ptr().add(x + 1), below.as_ptr().add(x), image.as_ptr().add(x)];
-            energy = dual_lanes(primal, weight, p0.as_mut_ptr().add(x), p1.as_mut_ptr().add(x), energy);
+        while x < whole {
+            energy = dual_lanes([row, below, image], weight, from, to, x, energy);
             x += L::N;
         }
-        // The last column has no right neighbour: its gradient to the right is 0, as is everything beyond it.
-        let pad = |slice: &[f32]| {
-            let mut lanes = [0f32; MAX_LANES];
-            lanes[..slice.len()].copy_from_slice(slice);
-            lanes
-        };
-        let mut right = pad(&row[x + 1..]);
-        right[width - 1 - x] = row[width - 1];
-        let (row, below, image) = (pad(&row[x..]), pad(&below[x..]), pad(&image[x..]));
-        let (mut q0, mut q1) = (pad(&p0[x..]), pad(&p1[x..]));
-        let primal = [row.as_ptr(), right.as_ptr(), below.as_ptr(), image.as_ptr()];
-        energy = dual_lanes(primal, weight, q0.as_mut_ptr(), q1.as_mut_ptr(), energy);
-        p0[x..].copy_from_slice(&q0[..width - x]);
-        p1[x..].copy_from_slice(&q1[..width - x]);
-        let mut sums = [0f32; MAX_LANES];
-        energy.store(sums.as_mut_ptr());
-        sums.iter().sum()
+        let mut lanes = [0f32; MAX_LANES];
+        energy.store(lanes.as_mut_ptr());
+        let mut sum: f32 = lanes.iter().sum();
+        if whole < width {
+            // The last vector reaches back over the one before; only its new columns count.
+            energy = dual_lanes([row, below, image], weight, from, to, width - L::N, L::splat(0.0));
+            energy.store(lanes.as_mut_ptr());
+            sum += lanes[L::N - (width - whole)..L::N].iter().sum::<f32>();
+        }
+        sum
     }
 }
 
-/// `N` columns of the dual step: `[row, right, below, image]` of the primal.
+/// The `N` columns from `x` on of [`dual_row`], with `[row, below, image]`. Returns `energy` with theirs added.
 ///
 /// # Safety
-/// Every pointer must have `N` floats, and the instruction set of `L` must be there.
+/// `x + N` must be at most the width of the row, and the instruction set of `L` must be there.
 #[inline(always)]
-unsafe fn dual_lanes<L: Lanes>(primal: [*const f32; 4], weight: f32, p0: *mut f32, p1: *mut f32, energy: L) -> L {
-    // SAFETY: the caller's.
+unsafe fn dual_lanes<L: Lanes>(
+    [row, below, image]: [&[f32]; 3],
+    weight: f32,
+    from: Option<&Rows>,
+    [to0, to1]: &mut Rows,
+    x: usize,
+    energy: L,
+) -> L {
+    // SAFETY: the caller's; the primal has a column more at its end, and the dual one at its beginning.
     unsafe {
-        let [u, right, below, image] = [L::load(primal[0]), L::load(primal[1]), L::load(primal[2]), L::load(primal[3])];
-        let (g0, g1, d) = (below.sub(u), right.sub(u), u.sub(image));
+        let u = L::load(row.as_ptr().add(x));
+        let g0 = L::load(below.as_ptr().add(x)).sub(u);
+        let g1 = L::load(row.as_ptr().add(x + 1)).sub(u);
+        let d = u.sub(L::load(image.as_ptr().add(x)));
         let norm = g0.mul_add(g0, g1.mul(g1)).sqrt();
         let shrink = norm.mul_add(L::splat(TAU / weight), L::splat(1.0)).recip();
+        let (mut p0, mut p1) = (L::splat(0.0), L::splat(0.0));
+        if let Some([from0, from1]) = from {
+            p0 = L::load(from0.as_ptr().add(x + 1));
+            p1 = L::load(from1.as_ptr().add(x + 1));
+        }
         let tau = L::splat(TAU);
-        tau.neg_mul_add(g0, L::load(p0)).mul(shrink).store(p0);
-        tau.neg_mul_add(g1, L::load(p1)).mul(shrink).store(p1);
+        tau.neg_mul_add(g0, p0).mul(shrink).store(to0.as_mut_ptr().add(x + 1));
+        tau.neg_mul_add(g1, p1).mul(shrink).store(to1.as_mut_ptr().add(x + 1));
         d.mul_add(d, norm.mul_add(L::splat(weight), energy))
-    }
-}
-
-/// [`dual_step`] and [`primal_step`] compiled for one instruction set.
-#[derive(Debug, Clone, Copy)]
-struct Kernel {
-    dual_step: unsafe fn(&Plane<'_>, &mut [f32], &mut [f32], &mut [f32]) -> f64,
-    primal_step: unsafe fn(&Plane<'_>, &[f32], &[f32], &mut [f32]),
-}
-
-macro_rules! kernel {
-    ($lanes:ty $(, $features:literal)?) => {{
-        $(#[target_feature(enable = $features)])?
-        unsafe fn dual(plane: &Plane<'_>, p0: &mut [f32], p1: &mut [f32], out: &mut [f32]) -> f64 {
-            // SAFETY: the caller's; the features are those of the vector.
-            unsafe { dual_step::<$lanes>(plane, p0, p1, out) }
-        }
-        $(#[target_feature(enable = $features)])?
-        unsafe fn primal(plane: &Plane<'_>, p0: &[f32], p1: &[f32], out: &mut [f32]) {
-            // SAFETY: the caller's; the features are those of the vector.
-            unsafe { primal_step::<$lanes>(plane, p0, p1, out) }
-        }
-        Kernel { dual_step: dual, primal_step: primal }
-    }};
-}
-
-impl Kernel {
-    /// Those that this machine can run, the fastest first.
-    fn available() -> Vec<Self> {
-        let mut kernels = Vec::new();
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx512f") {
-                kernels.push(kernel!(Avx512, "avx512f"));
-            }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                kernels.push(kernel!(Avx2, "avx2,fma"));
-            }
-        }
-        // On AArch64 it compiles to NEON, which is always there.
-        kernels.push(kernel!(Portable));
-        kernels
     }
 }
 
@@ -413,9 +442,9 @@ mod tests {
         for (h, w) in [(1, 1), (1, 9), (9, 1), (2, 2), (3, 5), (17, 16), (16, 17), (33, 49), (20, 255)] {
             for (weight, inner) in [(0.3, 5), (0.02, 5), (1.0, 1), (0.1, 30)] {
                 let noisy = uniform((2, 1, h, w), 3);
-                for kernel in Kernel::available() {
+                for sweep in Sweep::available() {
                     let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
-                    let mut tv = Tv { kernel, ..Tv::new(weight).inner(inner) };
+                    let mut tv = Tv { sweep, ..Tv::new(weight).inner(inner) };
                     tv.denoise(&CX, noisy.view(), out.view_mut()).unwrap();
                     for t in 0..2 {
                         let expected = reference(noisy.slice(ndarray::s![t, 0, .., ..]), f64::from(weight), inner);
