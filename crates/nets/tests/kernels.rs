@@ -1,10 +1,11 @@
 //! The convolution kernels against a slow loop in f64, golden arrays, finite differences, and themselves on other threads.
 
-use candle_core::{Device, Result, Tensor, Var};
-use nets::kernels::{Blocked, Conv3x3, Isa, PackedConv, Scratch, conv3x3, conv3x3_on};
+use candle_core::{DType, Device, Result, Tensor, Var};
+use nets::kernels::{Blocked, Conv3x3, Isa, LANES, PackedConv, Scratch, conv3x3, conv3x3_on};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
+use std::path::{Path, PathBuf};
 
 /// A convolution to check.
 #[derive(Debug, Clone, Copy)]
@@ -204,4 +205,328 @@ fn agrees_with_the_definition() -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Standard normal weights times He's scale, as networks have them.
+fn network_operands(case: &Case, seed: u64) -> Operands {
+    use rand_distr::{Distribution, StandardNormal};
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let scale = (2.0 / (9 * case.inputs) as f32).sqrt();
+    let mut ops = case.operands(seed);
+    for w in &mut ops.w {
+        let z: f32 = StandardNormal.sample(&mut rng);
+        *w = z * scale;
+    }
+    ops
+}
+
+/// The errors that the module header states.
+#[test]
+fn error_against_f64_is_as_stated() -> Result<()> {
+    for (channels, bounds) in [(64, BOUNDS_64), (96, BOUNDS_96)] {
+        let case = case(1, channels, channels, [40, 40], 1, 1);
+        let ops = network_operands(&case, 1);
+        let e = exact(&case, &ops);
+        for isa in available() {
+            let found = ours(isa, &case, &ops, false)?;
+            let expected = [&e.y, &e.dx, &e.dw];
+            for (((part, f), e), (max_bound, rms_bound)) in
+                ["y", "dx", "dw"].iter().zip(&found).zip(expected).zip(bounds)
+            {
+                let (max, mean) = distance(f, e);
+                println!("{channels} channels, {isa:?}, {part}: max {max:.2e}, RMS {mean:.2e}, of RMS {:.2}", rms(e));
+                assert!(
+                    max <= max_bound && mean <= rms_bound,
+                    "{channels} channels, {isa:?}, {part}: max {max:e}, RMS {mean:e}"
+                );
+            }
+        }
+    }
+    Ok(())
+}
+
+/// (max, RMS) for the result, the gradient by input and the gradient by weight.
+const BOUNDS_64: [(f64, f64); 3] = [(3e-5, 4e-6), (1e-5, 2e-6), (1e-3, 2e-4)];
+const BOUNDS_96: [(f64, f64); 3] = [(3e-5, 4e-6), (1e-5, 2e-6), (1e-3, 2e-4)];
+
+fn golden() -> Option<PathBuf> {
+    let roots = [
+        std::env::var_os("SCI_DATA").map(PathBuf::from),
+        Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared")),
+    ];
+    let found = roots
+        .into_iter()
+        .flatten()
+        .flat_map(|root| [root.join("golden/conv3x3.npz"), root.join("conv3x3.npz")])
+        .find(|p| p.is_file());
+    if found.is_none() {
+        println!("skipped: no golden/conv3x3.npz in SCI_DATA or ../shared");
+    }
+    found
+}
+
+#[test]
+fn agrees_with_pytorch() -> std::result::Result<(), Box<dyn std::error::Error>> {
+    let Some(path) = golden() else { return Ok(()) };
+    let mut npz = ndarray_npy::NpzReader::new(std::fs::File::open(path)?)?;
+    for k in 0..4 {
+        let mut array = |name: &str| npz.by_name::<ndarray::OwnedRepr<f32>, ndarray::IxDyn>(&format!("{k}_{name}"));
+        let [x, w, b, g] = [array("x")?, array("w")?, array("b")?, array("g")?];
+        let expected = [array("y")?, array("dx")?, array("dw")?, array("db")?];
+        let (s, o) = (x.shape(), w.shape()[0]);
+        let case = case(s[0], s[1], o, [s[2], s[3]], 1, 1);
+        let flat = |a: &ndarray::ArrayD<f32>| a.iter().copied().collect::<Vec<f32>>();
+        let ops = Operands { x: flat(&x), w: flat(&w), b: flat(&b), g: flat(&g) };
+        for isa in available() {
+            let found = ours(isa, &case, &ops, false)?;
+            for ((found, expected), part) in found.iter().zip(&expected).zip(["y", "dx", "dw", "db"]) {
+                let expected: Vec<f64> = expected.iter().map(|&v| v.into()).collect();
+                check(&format!("{part} of golden {k} on {isa:?}"), found, &expected, 2e-5);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// `Σ y·g` is linear in each argument, so a central difference of any width is its derivative.
+#[test]
+fn gradients_are_finite_differences() -> Result<()> {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for case in [
+        case(2, 17, 20, [6, 9], 1, 1),
+        case(1, 6, 20, [5, 7], 1, 2),
+        case(2, 7, 18, [5, 8], 2, 1),
+        case(1, 6, 4, [6, 5], 2, 2),
+    ] {
+        let ops = case.operands(4);
+        let isa = Isa::detect().map_err(candle_core::Error::wrap)?;
+        let [_, dx, dw, db] = ours(isa, &case, &ops, false)?;
+        let loss = |ops: &Operands| -> Result<f64> {
+            let [y, ..] = ours(isa, &case, ops, false)?;
+            Ok(y.iter().zip(&ops.g).map(|(&y, &g)| f64::from(y) * f64::from(g)).sum())
+        };
+        for (pick, grad) in [(0, &dx), (1, &dw), (2, &db)] {
+            for _ in 0..6 {
+                let at = rng.random_range(0..grad.len());
+                let moved = |by: f32| {
+                    let mut ops = case.operands(4);
+                    let target = [&mut ops.x, &mut ops.w, &mut ops.b];
+                    target.into_iter().nth(pick).expect("three arguments")[at] += by;
+                    loss(&ops)
+                };
+                let difference = (moved(1.0)? - moved(-1.0)?) / 2.0;
+                let error = (difference - f64::from(grad[at])).abs();
+                assert!(
+                    error < 2e-3 * difference.abs().max(1.0),
+                    "{case:?}, argument {pick} at {at}: {difference} by difference, {} by the kernel",
+                    grad[at]
+                );
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn relu_cuts_the_result_and_its_gradient() -> Result<()> {
+    for case in [case(2, 20, 33, [9, 14], 1, 1), case(1, 7, 5, [9, 14], 2, 1)] {
+        let mut ops = case.operands(5);
+        for isa in available() {
+            let [plain, ..] = ours(isa, &case, &ops, false)?;
+            let [y, dx, dw, db] = ours(isa, &case, &ops, true)?;
+            let cut: Vec<f32> = plain.iter().map(|&v| v.max(0.0)).collect();
+            assert_eq!(y, cut, "{case:?} on {isa:?}");
+            let g = ops.g.clone();
+            for (g, &y) in ops.g.iter_mut().zip(&y) {
+                *g = if y > 0.0 { *g } else { 0.0 };
+            }
+            let e = exact(&case, &ops);
+            ops.g = g;
+            check("dx behind a ReLU", &dx, &e.dx, 3e-5);
+            check("dw behind a ReLU", &dw, &e.dw, 3e-5);
+            check("db behind a ReLU", &db, &e.db, 1e-5);
+        }
+    }
+    Ok(())
+}
+
+fn on_threads<R: Send>(threads: usize, f: impl FnOnce() -> R + Send) -> R {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool").install(f)
+}
+
+fn bits(v: &[Vec<f32>]) -> Vec<Vec<u32>> {
+    v.iter().map(|v| v.iter().map(|x| x.to_bits()).collect()).collect()
+}
+
+#[test]
+fn same_bits_on_any_number_of_threads() {
+    for case in [case(5, 64, 40, [33, 70], 1, 1), case(3, 5, 20, [90, 140], 1, 1), case(3, 12, 30, [70, 41], 2, 3)] {
+        let ops = case.operands(6);
+        for isa in available() {
+            let run = |threads| on_threads(threads, || bits(&ours(isa, &case, &ops, true).expect("a result")));
+            let one = run(1);
+            for threads in [2, 3] {
+                assert!(run(threads) == one, "{case:?} on {isa:?}, {threads} threads");
+            }
+        }
+    }
+}
+
+/// A convolution of one image in the blocked layout.
+fn packed(isa: Isa, case: &Case, ops: &Operands, relu: bool) -> PackedConv {
+    PackedConv::new_on(isa, &ops.w, Some(&ops.b), case.inputs, case.outputs, case.opts(relu))
+        .expect("a valid convolution")
+}
+
+/// Whatever scratch, output and unused lanes held before, the result is that of planes, bit for bit.
+#[test]
+fn blocked_images_give_the_bits_of_planes() -> Result<()> {
+    let mut scratch = Scratch::default();
+    for isa in available() {
+        for c in CASES.iter().filter(|c| c.batch == 1) {
+            let ops = c.operands(7);
+            let conv = packed(isa, c, &ops, true);
+            let mut input = Blocked::default();
+            let mut output = Blocked::default();
+            let nan = vec![f32::NAN; ops.x.len()];
+            for x in [&nan, &ops.x] {
+                input.read_planes(c.inputs, c.height, c.width, x).expect("a whole image");
+                for y in 0..c.height {
+                    let last = input.blocks() - 1;
+                    for (i, v) in input.row_mut(last, y).iter_mut().enumerate() {
+                        if last * LANES + i % LANES >= c.inputs {
+                            *v = f32::NAN;
+                        }
+                    }
+                }
+                conv.forward(&input, &mut output, &mut scratch).expect("channels that fit");
+            }
+            let [h, w] = c.out();
+            assert_eq!(output.shape(), (c.outputs, h, w));
+            let mut found = vec![f32::NAN; c.outputs * h * w];
+            output.write_planes(&mut found).expect("a whole image");
+            let [expected, ..] = ours(isa, c, &ops, true)?;
+            assert!(bits(&[found]) == bits(&[expected]), "{c:?} on {isa:?}");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn planes_survive_the_blocked_layout() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let mut image = Blocked::default();
+    for (c, h, w) in [(1, 1, 1), (16, 16, 16), (17, 3, 35), (48, 2, 31), (5, 4, 40)] {
+        let planes = uniform(&mut rng, c * h * w, 1.0);
+        image.read_planes(c, h, w, &planes).expect("a whole image");
+        assert_eq!(image.row(0, h - 1)[(w - 1) * LANES], planes[h * w - 1]);
+        let mut back = vec![f32::NAN; planes.len()];
+        image.write_planes(&mut back).expect("a whole image");
+        assert_eq!(back, planes);
+    }
+}
+
+#[test]
+fn a_nan_reaches_its_pixel_and_stops_nothing() -> Result<()> {
+    for c in [case(1, 20, 20, [9, 9], 1, 1), case(1, 5, 5, [9, 9], 2, 1)] {
+        let mut ops = c.operands(9);
+        let [h, w] = c.out();
+        ops.x[4 * c.width + 4] = f32::NAN;
+        ops.g[0] = f32::INFINITY;
+        for isa in available() {
+            let [y, dx, dw, db] = ours(isa, &c, &ops, true)?;
+            assert!(y[4 / c.stride * w + 4 / c.stride].is_nan(), "{c:?} on {isa:?}");
+            assert!(y[h * w - 1].is_finite(), "a far pixel of {c:?} on {isa:?}");
+            assert_eq!((dx.len(), dw.len(), db.len()), (ops.x.len(), ops.w.len(), c.outputs));
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn only_what_is_asked_for_gets_a_gradient() -> Result<()> {
+    let cpu = &Device::Cpu;
+    let x = Tensor::ones((1, 3, 4, 4), DType::F32, cpu)?;
+    let w = Var::ones((2, 3, 3, 3), DType::F32, cpu)?;
+    let y = conv3x3(&x, &w, None, Conv3x3::default())?;
+    let grads = y.sum_all()?.backward()?;
+    assert!(grads.get(&x).is_none() && grads.get(&w).is_some());
+    Ok(())
+}
+
+/// f64 takes candle's own path, which is then an oracle of ours, strided views included.
+#[test]
+fn other_types_take_candles_path() -> Result<()> {
+    let c = case(2, 6, 8, [7, 10], 2, 2);
+    let ops = c.operands(10);
+    let cpu = &Device::Cpu;
+    let x = Tensor::from_slice(&ops.x, (2, 6, 10, 7), cpu)?.transpose(2, 3)?;
+    let w = Tensor::from_slice(&ops.w, (8, 3, 3, 3), cpu)?;
+    let b = Tensor::from_slice(&ops.b, 8, cpu)?;
+    let fast = conv3x3(&x, &w, Some(&b), c.opts(true))?;
+    let f64 = |t: &Tensor| t.to_dtype(DType::F64);
+    let slow = conv3x3(&f64(&x)?, &f64(&w)?, Some(&f64(&b)?), c.opts(true))?;
+    assert_eq!((fast.dtype(), slow.dtype()), (DType::F32, DType::F64));
+    check("conv3x3", &fast.flatten_all()?.to_vec1()?, &slow.flatten_all()?.to_vec1()?, 1e-5);
+    Ok(())
+}
+
+#[test]
+fn broken_rules_are_named() -> Result<()> {
+    let new = |w: usize, i, o, stride, groups| {
+        let opts = Conv3x3 { stride, groups, relu: false };
+        PackedConv::new(&vec![0.0; w], None, i, o, opts).map(drop).unwrap_err().to_string()
+    };
+    assert_eq!(new(9, 1, 1, 3, 1), "stride 3; it can be 1 or 2");
+    assert_eq!(new(9, 3, 2, 1, 2), "2 groups do not divide 3 input and 2 output channels");
+    assert_eq!(new(9, 3, 2, 1, 0), "0 groups do not divide 3 input and 2 output channels");
+    assert_eq!(new(8, 1, 1, 1, 1), "8 numbers where the shape has 9");
+    assert_eq!(
+        Isa::named("sse").unwrap_err().to_string(),
+        "SCI_KERNEL is \"sse\"; it can be avx512, avx2, neon or portable"
+    );
+    assert_eq!(Isa::named("portable"), Ok(Isa::Portable));
+    for isa in Isa::ALL {
+        assert_eq!(Isa::named(isa.name()).is_ok(), isa.available());
+    }
+
+    let conv = PackedConv::new(&[0.0; 9], None, 1, 1, Conv3x3::default()).expect("valid");
+    let (mut out, mut scratch) = (Blocked::default(), Scratch::default());
+    let mut forward = |image: &Blocked| conv.forward(image, &mut out, &mut scratch).unwrap_err().to_string();
+    assert_eq!(forward(&Blocked::zeros(2, 3, 3)), "2 channels go into a convolution of 1");
+    assert_eq!(forward(&Blocked::zeros(1, 0, 3)), "an empty image: [1, 1, 0, 3]");
+
+    let zeros = |s: &[usize]| Tensor::zeros(s, DType::F32, &Device::Cpu);
+    for (x, w, b) in [
+        (vec![1, 2, 4, 4], vec![1, 3, 3, 3], vec![1]),
+        (vec![1, 2, 4, 4], vec![1, 2, 5, 5], vec![1]),
+        (vec![1, 2, 4, 4], vec![3, 2, 3, 3], vec![2]),
+        (vec![2, 4, 4], vec![3, 2, 3, 3], vec![3]),
+        (vec![1, 2, 0, 4], vec![1, 2, 3, 3], vec![1]),
+    ] {
+        let (x, w, b) = (zeros(&x)?, zeros(&w)?, zeros(&b)?);
+        assert!(conv3x3(&x, &w, Some(&b), Conv3x3::default()).is_err(), "{x:?} {w:?} {b:?}");
+    }
+    Ok(())
+}
+
+proptest::proptest! {
+    #![proptest_config(proptest::prelude::ProptestConfig { cases: 48, failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_shape_agrees_with_the_definition(
+        batch in 1usize..3, groups in 1usize..4, inputs in 1usize..24, outputs in 1usize..24,
+        height in 1usize..20, width in 1usize..40, stride in 1usize..3, seed: u64,
+    ) {
+        let c = case(batch, groups * inputs, groups * outputs, [height, width], stride, groups);
+        let ops = c.operands(seed);
+        let e = exact(&c, &ops);
+        for isa in available() {
+            let [y, dx, dw, db] = ours(isa, &c, &ops, false).expect("a result");
+            check("y", &y, &e.y, 3e-5);
+            check("dx", &dx, &e.dx, 3e-5);
+            check("dw", &dw, &e.dw, 5e-5);
+            check("db", &db, &e.db, 1e-5);
+        }
+    }
 }

@@ -4,6 +4,7 @@ mod blocked;
 mod conv;
 mod direct;
 mod grad;
+mod memory;
 mod op;
 mod peak;
 mod scratch;
@@ -13,6 +14,7 @@ mod winograd;
 
 pub use blocked::Blocked;
 pub use conv::PackedConv;
+pub use memory::keep_freed_memory;
 pub use op::{Conv3x3, conv3x3, conv3x3_on};
 pub use peak::gemm_peak;
 pub use scratch::Scratch;
