@@ -1,0 +1,274 @@
+//! Owns `record.json`, what a run reports to other programs: benchmarks, tests and the report page read it.
+//!
+//! Field names are fixed by [`SCHEMA`]. JSON knows neither NaN nor infinity: every number that can be missing or not
+//! finite is an `Option`, and both `None` and a value that is not finite (the PSNR of equal images) become `null`.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::io::{FileError, ReadError, read_file};
+
+/// The version of the record's layout; a change of a name or a unit raises it.
+pub const SCHEMA: u32 = 1;
+
+/// One run of an experiment.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// [`SCHEMA`].
+    pub schema: u32,
+    /// The experiment's name, as in its file.
+    pub experiment: String,
+    /// The scene: the data's file name.
+    pub scene: String,
+    /// `gap`, `admm` or `two-stage`.
+    pub solver: String,
+    /// The denoiser's name; several are joined by ` → ` in the order of the stages.
+    pub denoiser: String,
+    /// One entry for each measurement, in the order they were solved.
+    pub measurements: Vec<MeasurementRecord>,
+    /// Means over `measurements`.
+    pub mean: MeanRecord,
+    /// The process's largest resident memory in bytes; 0 where the system does not tell.
+    pub peak_rss_bytes: u64,
+    /// Worker threads.
+    pub threads: usize,
+    /// The seed of everything random.
+    pub seed: u64,
+    /// Version of `sci`.
+    pub version: String,
+    /// Source revision `sci` was built from; empty if unknown.
+    pub revision: String,
+    /// The processor's name.
+    pub cpu: String,
+    /// The resolved experiment: paths absolute, defaults filled in.
+    pub config: serde_json::Value,
+}
+
+/// How one measurement went.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MeasurementRecord {
+    /// Index of the measurement in its file.
+    pub index: usize,
+    /// Mean PSNR over the frames in dB, data range 1, on the mosaic for color; `None` without a ground truth.
+    pub psnr_db: Option<f64>,
+    /// Mean SSIM over the frames, 7×7 uniform window (scikit-image's default).
+    pub ssim: Option<f64>,
+    /// Mean SSIM over the frames, 11×11 Gaussian window.
+    pub ssim_gaussian: Option<f64>,
+    /// Mean PSNR of the RGB frames in dB; `None` for gray scenes.
+    pub psnr_rgb_db: Option<f64>,
+    /// Wall-clock seconds of the solve with its warm start, without reading, writing and metrics.
+    pub seconds: f64,
+    /// Iterations done.
+    pub iterations: usize,
+    /// Why the solve ended.
+    pub stop: Stop,
+    /// ‖y − H x‖ / ‖y‖ of the result.
+    pub relative_residual: Option<f64>,
+    /// Online updates of the denoiser.
+    pub updates: usize,
+    /// Calls of the denoiser.
+    pub denoiser_calls: usize,
+    /// Work that was left out.
+    pub skipped: Skipped,
+    /// What happened, iteration by iteration.
+    pub trace: Trace,
+}
+
+/// Why a solve ended; the same reasons as [`admm::StopReason`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stop {
+    /// Every stage was run.
+    ScheduleDone,
+    /// The relative change fell to the tolerance.
+    Converged,
+    /// A value was not finite or the residual exploded; the result is the estimate before.
+    Diverged,
+    /// The time limit passed.
+    TimeUp,
+    /// Interrupted from outside.
+    Observer,
+}
+
+impl From<admm::StopReason> for Stop {
+    fn from(reason: admm::StopReason) -> Self {
+        match reason {
+            admm::StopReason::ScheduleDone => Self::ScheduleDone,
+            admm::StopReason::Converged => Self::Converged,
+            admm::StopReason::Diverged => Self::Diverged,
+            admm::StopReason::TimeUp => Self::TimeUp,
+            admm::StopReason::Observer => Self::Observer,
+        }
+    }
+}
+
+/// Work left out because it would not have changed the result.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Skipped {
+    /// Iterations of the schedule that were not run.
+    pub iterations: usize,
+    /// The share of tiles the denoiser left alone, 0 to 1.
+    pub tiles: f64,
+    /// Online updates that were due and not made.
+    pub updates: usize,
+}
+
+/// Series with one value for each iteration; empty where a quantity was not followed.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Trace {
+    /// Mean PSNR of the estimate in dB, computed outside the timed part.
+    pub psnr_db: Vec<Option<f64>>,
+    /// ‖y − H x‖ / ‖y‖.
+    pub relative_residual: Vec<Option<f64>>,
+    /// ‖x_k − x_{k−1}‖ / ‖x_k‖.
+    pub relative_change: Vec<Option<f64>>,
+    /// Seconds since the solve began.
+    pub seconds: Vec<f64>,
+}
+
+/// Means over the measurements of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MeanRecord {
+    /// Mean of the measurements' PSNR in dB; `None` if any has none.
+    pub psnr_db: Option<f64>,
+    /// Mean of the measurements' SSIM (7×7 uniform); `None` if any has none.
+    pub ssim: Option<f64>,
+    /// Mean seconds of a measurement.
+    pub seconds: f64,
+    /// Mean iterations of a measurement.
+    pub iterations: f64,
+}
+
+impl MeanRecord {
+    /// Averages `measurements`; zeros and `None` if there are none.
+    pub fn of(measurements: &[MeasurementRecord]) -> Self {
+        let count = measurements.len();
+        if count == 0 {
+            return Self::default();
+        }
+        let mean = |value: &dyn Fn(&MeasurementRecord) -> Option<f64>| {
+            measurements.iter().map(value).sum::<Option<f64>>().map(|sum| sum / count as f64)
+        };
+        Self {
+            psnr_db: mean(&|m| m.psnr_db),
+            ssim: mean(&|m| m.ssim),
+            seconds: mean(&|m| Some(m.seconds)).unwrap_or_default(),
+            iterations: mean(&|m| Some(m.iterations as f64)).unwrap_or_default(),
+        }
+    }
+}
+
+impl Record {
+    /// Reads a `record.json`.
+    ///
+    /// # Errors
+    /// [`FileError`] if it cannot be read, is not such a record, or has another [`SCHEMA`].
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        let malformed = |reason| FileError::new(path, ReadError::Malformed { format: "record.json", reason });
+        let record: Self = serde_json::from_slice(&read_file(path)?).map_err(|e| malformed(e.to_string()))?;
+        if record.schema != SCHEMA {
+            return Err(malformed(format!("schema {}, this version reads {SCHEMA}", record.schema)));
+        }
+        Ok(record)
+    }
+
+    /// The record as indented JSON, with a final newline.
+    ///
+    /// # Panics
+    /// Never: every field has a JSON form.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a record has only string keys and plain values") + "\n"
+    }
+}
+
+/// The machine and the build, as a record names them.
+pub mod host {
+    use std::fs;
+
+    /// Version of `sci`.
+    pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+    /// Source revision of the build; empty outside a Git checkout.
+    pub const REVISION: &str = env!("SCI_REVISION");
+
+    /// The processor's name, or its architecture where the system does not tell.
+    pub fn cpu() -> String {
+        fs::read_to_string("/proc/cpuinfo")
+            .ok()
+            .and_then(|info| field(&info, "model name").map(str::to_owned))
+            .unwrap_or_else(|| std::env::consts::ARCH.to_owned())
+    }
+
+    /// The largest resident memory of this process so far in bytes; 0 where the system does not tell.
+    pub fn peak_rss_bytes() -> u64 {
+        fs::read_to_string("/proc/self/status")
+            .ok()
+            .and_then(|status| field(&status, "VmHWM")?.split_whitespace().next()?.parse::<u64>().ok())
+            .map_or(0, |kib| kib * 1024)
+    }
+
+    /// The value of the first `name: value` line.
+    fn field<'a>(text: &'a str, name: &str) -> Option<&'a str> {
+        text.lines().find_map(|line| line.strip_prefix(name)?.trim_start().strip_prefix(':').map(str::trim))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The example of the format's description, with every name a reader may rely on.
+    const EXAMPLE: &str = r#"
+{ "schema": 1, "experiment": "gray/gap-tv", "scene": "traffic48.mat", "solver": "gap", "denoiser": "tv",
+  "measurements": [ { "index": 0, "psnr_db": 20.76, "ssim": 0.687, "ssim_gaussian": 0.70, "psnr_rgb_db": null, "seconds": 0.05, "iterations": 40,
+      "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },
+      "trace": { "psnr_db": [], "relative_residual": [], "relative_change": [], "seconds": [] } } ],
+  "mean": { "psnr_db": 20.76, "ssim": 0.687, "seconds": 0.05, "iterations": 40.0 },
+  "peak_rss_bytes": 0, "threads": 2, "seed": 0, "version": "", "revision": "", "cpu": "", "config": { } }"#;
+
+    #[test]
+    fn names_are_those_of_the_format() {
+        let expected: serde_json::Value = serde_json::from_str(EXAMPLE).unwrap();
+        let record: Record = serde_json::from_str(EXAMPLE).unwrap();
+        let written: serde_json::Value = serde_json::from_str(&record.to_json()).unwrap();
+        assert_eq!(written, expected);
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_become_null() {
+        let mut record: Record = serde_json::from_str(EXAMPLE).unwrap();
+        record.measurements[0].psnr_db = Some(f64::INFINITY);
+        record.measurements[0].ssim = Some(f64::NAN);
+        record.measurements[0].trace.psnr_db = vec![Some(20.0), Some(f64::INFINITY)];
+        let back: Record = serde_json::from_str(&record.to_json()).unwrap();
+        assert_eq!((back.measurements[0].psnr_db, back.measurements[0].ssim), (None, None));
+        assert_eq!(back.measurements[0].trace.psnr_db, [Some(20.0), None]);
+    }
+
+    #[test]
+    fn means_are_missing_where_a_value_is() {
+        let record: Record = serde_json::from_str(EXAMPLE).unwrap();
+        let first = record.measurements[0].clone();
+        let second = MeasurementRecord { psnr_db: Some(30.76), ssim: None, iterations: 21, ..first.clone() };
+        let mean = MeanRecord::of(&[first, second]);
+        assert_eq!((mean.psnr_db, mean.ssim, mean.iterations), (Some(25.76), None, 30.5));
+        assert_eq!(MeanRecord::of(&[]), MeanRecord::default());
+    }
+
+    #[test]
+    fn another_schema_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("record.json");
+        std::fs::write(&path, EXAMPLE.replacen("\"schema\": 1", "\"schema\": 7", 1)).unwrap();
+        let error = Record::read(&path).unwrap_err().to_string();
+        assert!(error.contains("record.json") && error.contains("schema 7"), "{error}");
+    }
+
+    #[test]
+    fn this_process_has_a_size_and_a_processor() {
+        assert!(!host::cpu().is_empty());
+        assert!(!cfg!(target_os = "linux") || host::peak_rss_bytes() > 1 << 20);
+    }
+}
