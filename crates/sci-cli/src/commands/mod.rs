@@ -1,0 +1,156 @@
+//! Owns the command line: one module a command, and the exit code that each kind of error gives.
+//!
+//! 0 done · 1 failed · 2 bad usage or bad TOML · 130 interrupted (what was finished is written).
+
+/// `println!` that ends the program quietly when nobody reads on, as under `sci … | head`.
+macro_rules! outln {
+    ($($arg:tt)*) => {{
+        use std::io::Write as _;
+        if let Err(e) = writeln!(std::io::stdout(), $($arg)*) {
+            let code = if e.kind() == std::io::ErrorKind::BrokenPipe { 0 } else { 1 };
+            std::process::exit(code);
+        }
+    }};
+}
+
+mod mask;
+mod metrics;
+mod report;
+mod run;
+mod simulate;
+mod weights;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+
+use crate::config::ConfigError;
+
+/// Reconstruct video from snapshot compressive measurements.
+#[derive(Debug, Parser)]
+#[command(name = "sci", version, about, max_term_width = 100)]
+pub struct Cli {
+    /// Worker threads [default: all]; results do not depend on it
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run an experiment file
+    Run(run::Args),
+    /// Make masks and measurements from a video
+    Simulate(simulate::Args),
+    /// Make a stack of masks
+    Mask(mask::Args),
+    /// Compare two videos: PSNR and SSIM
+    Metrics(metrics::Args),
+    /// Look into weight files
+    #[command(subcommand)]
+    Weights(weights::Command),
+    /// Render report.html of finished runs again, and compare them
+    Report(report::Args),
+}
+
+/// How a command ended well.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Done {
+    /// Everything was done.
+    Complete,
+    /// The user stopped it; what was finished is written.
+    Interrupted,
+}
+
+/// A mistake in how a command was called, as opposed to one that happened while it ran.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct UsageError(pub String);
+
+impl Cli {
+    /// Runs the command and prints its error, if any.
+    pub fn execute(self) -> ExitCode {
+        match self.dispatch() {
+            Ok(Done::Complete) => ExitCode::SUCCESS,
+            Ok(Done::Interrupted) => ExitCode::from(130),
+            Err(error) => {
+                eprintln!("error: {}", chain(&error));
+                let usage = error.is::<ConfigError>() || error.is::<UsageError>();
+                ExitCode::from(if usage { 2 } else { 1 })
+            }
+        }
+    }
+
+    fn dispatch(self) -> anyhow::Result<Done> {
+        if let Some(n) = self.threads {
+            rayon::ThreadPoolBuilder::new()
+                .num_threads(usize::from(n))
+                .build_global()
+                .context("cannot start the worker threads")?;
+        }
+        match self.command {
+            Command::Run(args) => args.run(),
+            Command::Simulate(args) => args.run(),
+            Command::Mask(args) => args.run(),
+            Command::Metrics(args) => args.run(),
+            Command::Weights(command) => command.run(),
+            Command::Report(args) => args.run(),
+        }
+    }
+}
+
+/// The error and its causes on one line; a cause that the error before it already quotes is not repeated.
+fn chain(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let part = cause.to_string();
+        if text.is_empty() {
+            text = part;
+        } else if !text.ends_with(&part) {
+            text = format!("{text}: {part}");
+        }
+    }
+    text
+}
+
+/// Set by the first Ctrl-C.
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Whether the user asked to stop.
+fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}
+
+/// Makes the first Ctrl-C a request to stop, and the second one final.
+fn catch_interrupts() -> anyhow::Result<()> {
+    ctrlc::set_handler(|| {
+        if INTERRUPTED.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("stopping after this iteration; what is finished will be written (Ctrl-C again to quit at once)");
+    })
+    .context("cannot handle Ctrl-C")
+}
+
+/// A size as `HEIGHTxWIDTH`.
+fn parse_size(text: &str) -> Result<(usize, usize), String> {
+    let side = |s: &str| s.parse::<usize>().ok().filter(|n| (1..=65_535).contains(n));
+    text.split_once('x')
+        .and_then(|(h, w)| Some((side(h)?, side(w)?)))
+        .ok_or_else(|| "expected HEIGHTxWIDTH, each 1 to 65535, for example 256x256".into())
+}
+
+fn parse_density(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|d| (1e-3..=1.0).contains(d)).ok_or_else(|| "expected a number from 0.001 to 1".into())
+}
+
+/// A path whose extension says how to write arrays.
+fn array_format(path: &PathBuf) -> anyhow::Result<crate::io::output::ArrayFormat> {
+    crate::io::output::ArrayFormat::of(path).ok_or_else(|| {
+        UsageError(format!("--out {}: expected a name that ends in .npy, .npz or .mat", path.display())).into()
+    })
+}

@@ -1,0 +1,306 @@
+//! `sci run`: an experiment from its file to a folder of results.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use admm::{BoxError, IterInfo, Observer, Plan, Problem, StopReason};
+use anyhow::Context;
+use ndarray::{Array3, ArrayView3, Axis};
+use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
+use sci_forward::{SensingOperator, VideoShape};
+
+use super::{Done, UsageError, catch_interrupts, interrupted};
+use crate::config::resolve::{Experiment, MaskSource, OutputFormat, Simulate};
+use crate::config::{self};
+use crate::factory::{Factory, Solved};
+use crate::io::output::{ArrayFormat, Part, Staging, write_arrays, write_frames, write_preview};
+use crate::io::scene::{self, Scene};
+use crate::progress::Progress;
+use crate::record::{MeanRecord, MeasurementRecord, Record, SCHEMA, Skipped, Trace, host};
+// use crate::report;
+use crate::simulate::{NoiseModel, simulate};
+
+/// Arguments of `sci run`.
+#[derive(Debug, clap::Args)]
+pub(super) struct Args {
+    /// The experiment file, TOML
+    config: PathBuf,
+    /// Override a key of the file, for example --set stage.0.sigma=25 or --set data.path=traffic48.mat
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Where to write [default: runs/<name>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+impl Args {
+    pub(super) fn run(self) -> anyhow::Result<Done> {
+        let experiment = config::load(&self.config, &self.set)?;
+        let out = self.out.unwrap_or_else(|| Path::new("runs").join(&experiment.name));
+        if out.exists() && !out.is_dir() {
+            return Err(UsageError(format!("--out {}: it is a file, expected a folder", out.display())).into());
+        }
+        catch_interrupts()?;
+        let scene = read_scene(&experiment).context("data")?;
+        scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
+        let chosen = choose(&experiment, &scene)?;
+        let mut factory = Factory::new(&experiment)?;
+        announce(&experiment, &scene, chosen.len());
+        let results = solve_all(&experiment, &scene, &chosen, &mut factory)?;
+        if results.is_empty() {
+            eprintln!("stopped before the first iteration: nothing to write");
+            return Ok(Done::Interrupted);
+        }
+        finish(&experiment, &scene, &results, &out)
+    }
+}
+
+fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
+    let data = &experiment.data;
+    let Some(s) = &data.simulate else { return Ok(scene::read(&data.path, &data.reading)?) };
+    let truth = scene::read_gray_video(&data.path, &data.reading)?;
+    let (_, height, width) = truth.dim();
+    let masks = masks(s, &data.reading, height, width)?;
+    let noise = NoiseModel { sigma: s.sigma, photons: s.photons, seed: s.seed };
+    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, &noise)?)
+}
+
+fn masks(
+    s: &Simulate,
+    reading: &scene::Reading,
+    height: usize,
+    width: usize,
+) -> anyhow::Result<sci_forward::MaskStack> {
+    use sci_forward::MaskStack;
+    let shape = |frames| VideoShape { frames, height, width };
+    Ok(match &s.mask {
+        MaskSource::Random(r) => MaskStack::random(shape(r.frames), r.density, r.seed)?,
+        MaskSource::Shifting(r) => MaskStack::shifting(shape(r.frames), r.density, r.seed)?,
+        MaskSource::File(path) => scene::read_mask(path, reading)?,
+    })
+}
+
+fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
+    let count = scene.len();
+    let chosen = experiment.data.measurements.clone().unwrap_or_else(|| (0..count).collect());
+    match chosen.iter().find(|&&k| k >= count) {
+        None => Ok(chosen),
+        Some(k) => Err(UsageError(format!(
+            "{}: `data.measurements` names {k}, but the scene has {count} (legal: 0 to {})",
+            experiment.data.path.display(),
+            count - 1
+        ))
+        .into()),
+    }
+}
+
+fn announce(experiment: &Experiment, scene: &Scene, count: usize) {
+    let plural = if count == 1 { "" } else { "s" };
+    outln!(
+        "{} on {}: {} + {}, {count} measurement{plural} of {}",
+        experiment.name,
+        experiment.scene_name(),
+        experiment.solver_kind(),
+        experiment.denoiser_kinds(),
+        scene.operator.shape()
+    );
+}
+
+/// One solved measurement.
+struct Solution {
+    record: MeasurementRecord,
+    estimate: Array3<f32>,
+}
+
+fn solve_all(
+    experiment: &Experiment,
+    scene: &Scene,
+    chosen: &[usize],
+    factory: &mut Factory<'_>,
+) -> anyhow::Result<Vec<Solution>> {
+    let mut solutions: Vec<Solution> = Vec::new();
+    let planned = factory.plan().iterations();
+    for &k in chosen {
+        if interrupted() {
+            break;
+        }
+        let truth = scene.truth_of(k);
+        let problem = Problem::new(&scene.operator, scene.measurement(k))?;
+        let mut watch = Watch::new(truth, Progress::new(k, planned));
+        let previous = solutions.last().map(|s| s.estimate.view());
+        let solved = factory.solve(&problem, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
+        let trace = watch.finish();
+        let solution = solution(k, solved, truth, trace, planned);
+        outln!("{}", line(&solution.record));
+        if solution.record.stop == crate::record::Stop::Diverged {
+            eprintln!("{}", advice(&solution.record, experiment));
+        }
+        solutions.push(solution);
+    }
+    Ok(solutions)
+}
+
+fn solution(
+    index: usize,
+    solved: Solved,
+    truth: Option<ArrayView3<'_, f32>>,
+    trace: Trace,
+    planned: usize,
+) -> Solution {
+    let Solved { outcome, denoiser_calls } = solved;
+    let x = outcome.estimate.view();
+    // Stopping early because nothing changes any more saves iterations; being stopped does not.
+    let saved = if outcome.stop == StopReason::Converged { planned - outcome.iterations } else { 0 };
+    let record = MeasurementRecord {
+        index,
+        psnr_db: truth.map(|t| mean_over_frames(t, x, psnr)),
+        ssim: truth.map(|t| mean_over_frames(t, x, ssim)),
+        ssim_gaussian: truth.map(|t| mean_over_frames(t, x, ssim_gaussian)),
+        psnr_rgb_db: None,
+        seconds: outcome.seconds,
+        iterations: outcome.iterations,
+        stop: outcome.stop.into(),
+        relative_residual: Some(outcome.relative_residual),
+        updates: 0,
+        denoiser_calls,
+        skipped: Skipped { iterations: saved, ..Skipped::default() },
+        trace,
+    };
+    Solution { record, estimate: outcome.estimate }
+}
+
+fn line(m: &MeasurementRecord) -> String {
+    use crate::record::Stop;
+    let quality = match (m.psnr_db, m.ssim) {
+        (Some(p), Some(s)) => format!("PSNR {p:6.2} dB   SSIM {s:.4}"),
+        _ => format!("residual {:.2e}", m.relative_residual.unwrap_or(f64::NAN)),
+    };
+    let note = match m.stop {
+        Stop::ScheduleDone => "",
+        Stop::Converged => "   converged",
+        Stop::Diverged => "   DIVERGED (last good estimate)",
+        Stop::TimeUp => "   time up",
+        Stop::Observer => "   stopped",
+    };
+    format!("measurement {:>2}   {quality}   {} iterations   {:.2} s{note}", m.index, m.iterations, m.seconds)
+}
+
+fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
+    use crate::config::check::{Momentum, Solver, Start};
+    let suggestion = match (experiment.start, experiment.solver) {
+        (Start::Adjoint, _) => "start from solver.start = \"mean\" (the adjoint is not normalised)",
+        (_, Solver::Gap { momentum: Some(Momentum::Zero) }) => "set solver.momentum = \"measurement\"",
+        (_, Solver::Gap { momentum: Some(_) }) => "set solver.accelerate = false",
+        (_, Solver::Gap { momentum: None }) => "raise stage.0.sigma, or use another denoiser",
+        (_, Solver::Admm { .. }) => "raise solver.gamma, or use solver.kind = \"gap\"",
+    };
+    format!("measurement {} diverged in iteration {}: {suggestion}", m.index, m.iterations.saturating_sub(1))
+}
+
+/// Follows one solve: convergence curve, progress, Ctrl-C.
+struct Watch<'t> {
+    truth: Option<ArrayView3<'t, f32>>,
+    trace: Trace,
+    progress: Progress,
+}
+
+impl<'t> Watch<'t> {
+    fn new(truth: Option<ArrayView3<'t, f32>>, progress: Progress) -> Self {
+        Self { truth, trace: Trace::default(), progress }
+    }
+
+    fn finish(self) -> Trace {
+        self.progress.finish();
+        self.trace
+    }
+}
+
+impl Observer for Watch<'_> {
+    fn begin(&mut self, _: &Plan) -> Result<(), BoxError> {
+        self.progress.start();
+        Ok(())
+    }
+
+    fn iteration(&mut self, it: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
+        let psnr_db = self.truth.map(|truth| mean_over_frames(truth, it.estimate, psnr));
+        if psnr_db.is_some() {
+            self.trace.psnr_db.push(psnr_db);
+        }
+        self.trace.relative_residual.push(Some(it.relative_residual));
+        self.trace.relative_change.push(Some(it.relative_change));
+        self.trace.seconds.push(it.seconds);
+        self.progress.step(it.iteration + 1, psnr_db);
+        Ok(if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+    }
+}
+
+/// Writes the run and says how it went.
+fn finish(experiment: &Experiment, scene: &Scene, solutions: &[Solution], out: &Path) -> anyhow::Result<Done> {
+    let record = record(experiment, solutions);
+    if let (Some(p), Some(s), true) = (record.mean.psnr_db, record.mean.ssim, solutions.len() > 1) {
+        outln!("mean             PSNR {p:6.2} dB   SSIM {s:.4}   {:.2} s", record.mean.seconds);
+    }
+    write(experiment, scene, solutions, &record, out)?;
+    outln!("wrote {}", out.join("report.html").display());
+    let diverged = record.measurements.iter().filter(|m| m.stop == crate::record::Stop::Diverged).count();
+    anyhow::ensure!(
+        diverged == 0,
+        "{diverged} of {} measurements diverged; {} holds the last good estimates, marked in record.json",
+        record.measurements.len(),
+        out.display()
+    );
+    Ok(if interrupted() { Done::Interrupted } else { Done::Complete })
+}
+
+fn record(experiment: &Experiment, solutions: &[Solution]) -> Record {
+    let measurements: Vec<MeasurementRecord> = solutions.iter().map(|s| s.record.clone()).collect();
+    Record {
+        schema: SCHEMA,
+        experiment: experiment.name.clone(),
+        scene: experiment.scene_name(),
+        solver: experiment.solver_kind().to_owned(),
+        denoiser: experiment.denoiser_kinds(),
+        mean: MeanRecord::of(&measurements),
+        measurements,
+        peak_rss_bytes: host::peak_rss_bytes(),
+        threads: rayon::current_num_threads(),
+        seed: experiment.seed,
+        version: host::VERSION.to_owned(),
+        revision: host::REVISION.to_owned(),
+        cpu: host::cpu(),
+        config: experiment.to_json(),
+    }
+}
+
+fn write(
+    experiment: &Experiment,
+    scene: &Scene,
+    solutions: &[Solution],
+    record: &Record,
+    out: &Path,
+) -> anyhow::Result<()> {
+    let staging = Staging::new(out)?;
+    let dir = staging.path();
+    let output = &experiment.output;
+    let views: Vec<ArrayView3<'_, f32>> = solutions.iter().map(|s| s.estimate.view()).collect();
+    let video = ndarray::concatenate(Axis(0), &views).context("joining the measurements")?.insert_axis(Axis(1));
+    let format = match output.format {
+        OutputFormat::Npy => ArrayFormat::Npy,
+        OutputFormat::Npz => ArrayFormat::Npz,
+        OutputFormat::Mat => ArrayFormat::Mat,
+    };
+    let recon = dir.join(format!("recon.{}", format.extension()));
+    write_arrays(&recon, format, &[Part { name: "recon", data: video.view(), is_light: true }])?;
+    if output.frames {
+        let b = scene.frames();
+        let name = |i: usize| format!("m{:02}_t{:02}.png", solutions[i / b].record.index, i % b);
+        write_frames(&dir.join("frames"), video.view(), name)?;
+    }
+    if output.preview {
+        write_preview(&dir.join("preview.gif"), video.view(), output.fps)?;
+    }
+    // report::write(&dir.join("report.html"), record, scene, &views).context("report.html")?;
+    std::fs::write(dir.join("record.json"), record.to_json()).context("record.json")?;
+    staging.commit()?;
+    Ok(())
+}

@@ -1,0 +1,103 @@
+//! `sci simulate`: a video to a scene file of masks, measurements and truth.
+
+use std::path::PathBuf;
+
+use ndarray::{Array3, Axis, s};
+use sci_forward::VideoShape;
+
+use super::mask::Kind;
+use super::{Done, UsageError, array_format, parse_density};
+use crate::io::output::{ArrayFormat, Part, write_arrays};
+use crate::io::scene::{self, Keys, Reading};
+use crate::simulate::{NoiseModel, simulate};
+
+/// Arguments of `sci simulate`.
+#[derive(Debug, clap::Args)]
+pub(super) struct Args {
+    /// The video: .gif, .y4m, a folder of PNGs, .npy, .npz or .mat; color becomes gray
+    video: PathBuf,
+    /// Where to write the scene: .npz or .mat
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// How the masks' pixels open
+    #[arg(long, value_enum, default_value = "random")]
+    mask: Kind,
+    /// Take the masks from a file instead: .npy, .npz, .mat or a folder of PNGs
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["mask", "frames", "density"])]
+    mask_file: Option<PathBuf>,
+    /// Frames a measurement sums
+    #[arg(long, default_value = "8", value_name = "B", value_parser = clap::value_parser!(u16).range(2..=1024))]
+    frames: u16,
+    /// Share of open pixels, 0.001 to 1
+    #[arg(long, default_value = "0.5", value_parser = parse_density)]
+    density: f64,
+    /// Measurements to make [default: as many as the video fills]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    measurements: Option<u32>,
+    /// Gaussian noise, standard deviation in units of an 8-bit picture
+    #[arg(long, default_value = "0", value_parser = parse_sigma)]
+    sigma: f32,
+    /// Shot noise: photons a pixel counts at full scale of one frame [default: none]
+    #[arg(long, value_parser = parse_photons)]
+    photons: Option<f64>,
+    /// Seed of masks and noise
+    #[arg(long, default_value = "0")]
+    seed: u64,
+}
+
+fn parse_sigma(text: &str) -> Result<f32, String> {
+    text.parse().ok().filter(|s| (0.0..=255.0).contains(s)).ok_or_else(|| "expected a number from 0 to 255".into())
+}
+
+fn parse_photons(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|p| (1e-3..=1e9).contains(p)).ok_or_else(|| "expected a number from 0.001 to 1e9".into())
+}
+
+impl Args {
+    pub(super) fn run(self) -> anyhow::Result<Done> {
+        let format = array_format(&self.out)?;
+        if format == ArrayFormat::Npy {
+            return Err(UsageError(format!(
+                "--out {}: a scene is several arrays; name a .npz or .mat file",
+                self.out.display()
+            ))
+            .into());
+        }
+        let mut truth = scene::read_gray_video(&self.video, &Reading::default())?;
+        let (_, height, width) = truth.dim();
+        let masks = match &self.mask_file {
+            Some(file) => scene::read_mask(file, &Reading::default())?,
+            None => {
+                self.mask.masks(VideoShape { frames: self.frames.into(), height, width }, self.density, self.seed)?
+            }
+        };
+        if let Some(n) = self.measurements {
+            let wanted = n as usize * masks.shape().frames;
+            let there = truth.len_of(Axis(0));
+            anyhow::ensure!(
+                wanted <= there,
+                "{}: --measurements {n} needs {wanted} frames, the video has {there}",
+                self.video.display()
+            );
+            truth = truth.slice_move(s![..wanted, .., ..]);
+        }
+        let noise = NoiseModel { sigma: self.sigma / 255.0, photons: self.photons, seed: self.seed };
+        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, &noise)?;
+        scene.warnings.iter().for_each(|w| eprintln!("warning: {w}"));
+        let mask = scene.operator.masks().view();
+        let truth: &Array3<f32> = scene.truth.as_ref().expect("a simulated scene keeps its truth");
+        let parts = [
+            Part { name: "mask", data: mask.insert_axis(Axis(1)), is_light: false },
+            Part { name: "meas", data: scene.measurements.view().insert_axis(Axis(1)), is_light: true },
+            Part { name: "orig", data: truth.view().insert_axis(Axis(1)), is_light: true },
+        ];
+        write_arrays(&self.out, format, &parts)?;
+        outln!(
+            "{}: {} measurements of {}",
+            self.out.display(),
+            scene.len(),
+            VideoShape { frames: scene.frames(), height, width }
+        );
+        Ok(Done::Complete)
+    }
+}

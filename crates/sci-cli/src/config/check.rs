@@ -1,0 +1,548 @@
+//! Owns the rules: from keys to values that are in range, complete, and have an effect.
+
+use std::ops::{Range, RangeInclusive};
+
+use toml::Spanned;
+
+use super::file::*;
+use super::source::{ConfigError, Source};
+use crate::io::scene::{Axes, Keys, Reading};
+
+/// A path as written, with what is needed to look it up and to report it.
+#[derive(Clone, Debug)]
+pub struct PathSetting {
+    /// Dotted key.
+    pub key: String,
+    /// As written.
+    pub text: String,
+    /// Where.
+    pub span: Range<usize>,
+}
+
+/// `[data]`.
+#[derive(Clone, Debug)]
+pub struct Data {
+    /// The scene or the video.
+    pub path: PathSetting,
+    /// Measurements to reconstruct, `None` for all.
+    pub measurements: Option<Vec<usize>>,
+    /// How to understand the file.
+    pub reading: Reading,
+    /// Set for `kind = "simulate"`.
+    pub simulate: Option<Simulate>,
+}
+
+/// What turns a video into measurements.
+#[derive(Clone, Debug)]
+pub struct Simulate {
+    /// The masks.
+    pub mask: Mask,
+    /// Gaussian noise, standard deviation in 0..255 units; 0 for none.
+    pub sigma: f32,
+    /// Photons per unit of y, `None` for no shot noise.
+    pub photons: Option<f64>,
+    /// Seed of the noise.
+    pub seed: u64,
+}
+
+/// `[data.mask]`.
+#[derive(Clone, Debug)]
+pub enum Mask {
+    /// Independent random pixels.
+    Random(RandomMask),
+    /// One random pattern, moved by a pixel a frame.
+    Shifting(RandomMask),
+    /// Masks from a file.
+    File(PathSetting),
+}
+
+/// The parameters of random masks.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RandomMask {
+    /// B.
+    pub frames: usize,
+    /// Open fraction.
+    pub density: f64,
+    /// Seed.
+    pub seed: u64,
+}
+
+/// Where a solve starts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Start {
+    /// The measurement divided by the masks' sum.
+    Mean,
+    /// `Hᵀy`.
+    Adjoint,
+    /// The result of the measurement before; the first starts from the mean.
+    Previous,
+    /// A few iterations of GAP-TV.
+    Tv {
+        /// Iterations.
+        iterations: usize,
+        /// TV weight.
+        weight: f32,
+    },
+}
+
+/// `[solver]`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Solver {
+    /// Generalised alternating projection.
+    Gap {
+        /// `None` for plain GAP, else whether y1 starts from zero (the reference) or from the measurement.
+        momentum: Option<Momentum>,
+    },
+    /// ADMM.
+    Admm {
+        /// γ.
+        gamma: f32,
+    },
+}
+
+/// Where y1 of accelerated GAP starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Momentum {
+    /// At 0.
+    Zero,
+    /// At y.
+    Measurement,
+}
+
+/// `[denoiser]`.
+#[derive(Clone, Debug)]
+pub enum Denoiser {
+    /// Total variation.
+    Tv {
+        /// Weight.
+        weight: f32,
+        /// Dual steps a call.
+        inner: usize,
+        /// Keep the dual field between calls.
+        warm_dual: bool,
+    },
+    /// FFDNet.
+    Ffdnet {
+        /// Weight file.
+        weights: PathSetting,
+    },
+}
+
+/// One `[[stage]]`.
+#[derive(Clone, Debug)]
+pub struct Stage {
+    /// σ in 0..255 units, 0 for denoisers without one.
+    pub sigma: f32,
+    /// Iterations.
+    pub iterations: usize,
+    /// Index into [`Checked::denoisers`].
+    pub denoiser: usize,
+}
+
+/// The format of the reconstruction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OutputFormat {
+    /// `recon.npy`.
+    Npy,
+    /// `recon.npz`.
+    Npz,
+    /// `recon.mat`, v5.
+    Mat,
+}
+
+/// `[output]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Output {
+    /// Format of the reconstruction.
+    pub format: OutputFormat,
+    /// Write PNG frames.
+    pub frames: bool,
+    /// Write an animated GIF.
+    pub preview: bool,
+    /// Its frames a second.
+    pub fps: u16,
+}
+
+/// An experiment whose every value is legal; paths are not looked up yet.
+#[derive(Clone, Debug)]
+pub struct Checked {
+    /// Name, a relative path.
+    pub name: Option<String>,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// `[data]`.
+    pub data: Data,
+    /// `[solver]`.
+    pub solver: Solver,
+    /// Where solves start.
+    pub start: Start,
+    /// All denoisers, the default first.
+    pub denoisers: Vec<Denoiser>,
+    /// The stages.
+    pub stages: Vec<Stage>,
+    /// Stop once the relative change is at most this; 0 never.
+    pub relative_change: f64,
+    /// Stop a measurement after so many seconds.
+    pub seconds: Option<f64>,
+    /// `[output]`.
+    pub output: Output,
+}
+
+const TOP: [&str; 10] = ["name", "seed", "data", "solver", "denoiser", "stage", "stop", "skip", "online", "output"];
+const MAX_ITERATIONS: i64 = 100_000;
+const SEEDS: RangeInclusive<i64> = 0..=i64::MAX;
+
+/// Checks an experiment.
+///
+/// # Errors
+/// The first broken rule.
+pub fn check(source: &Source) -> Result<Checked, ConfigError> {
+    Checker { source }.experiment()
+}
+
+struct Checker<'s> {
+    source: &'s Source,
+}
+
+impl<'s> Checker<'s> {
+    fn experiment(&self) -> Result<Checked, ConfigError> {
+        let mut root = Section::root(self.source)?;
+        root.only(&TOP)?;
+        let data = root.take("data")?;
+        let solver = root.take("solver")?;
+        let denoiser = root.take("denoiser")?;
+        let stages = root.take_list("stage")?;
+        let stop = root.take("stop")?;
+        let switches = [("skip", root.take("skip")?), ("online", root.take("online")?)];
+        let output = root.take("output")?;
+        let top: TopKeys = root.read(&[])?;
+        let seed = self.whole("seed", &top.seed, SEEDS)?.unwrap_or(0) as u64;
+        let missing = |key: &str| self.source.file_error(format!("no [{key}] table"));
+        let data = self.data(data.ok_or_else(|| missing("data"))?, seed)?;
+        let (solver, start) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
+        let (denoisers, stages) = self.stages(denoiser, stages)?;
+        for (key, section) in switches {
+            self.switched_off(key, section)?;
+        }
+        let (relative_change, seconds) = self.stop(stop)?;
+        let name = self.name(top.name)?;
+        let output = self.output(output)?;
+        Ok(Checked { name, seed, data, solver, start, denoisers, stages, relative_change, seconds, output })
+    }
+
+    fn name(&self, name: Option<Spanned<String>>) -> Result<Option<String>, ConfigError> {
+        let Some(name) = name else { return Ok(None) };
+        let legal = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+        let part_ok = |p: &str| !p.is_empty() && !p.starts_with('.') && p.chars().all(legal);
+        if !name.get_ref().split('/').all(part_ok) {
+            return Err(self.value_error(
+                "name",
+                &name.span(),
+                "letters, digits, '.', '_' and '-', in parts joined by '/'",
+            ));
+        }
+        Ok(Some(name.into_inner()))
+    }
+
+    fn data(&self, mut section: Section<'s>, seed: u64) -> Result<Data, ConfigError> {
+        let span = section.span.clone();
+        let kind = section.take_kind(&["scene", "simulate"], Some("scene"))?;
+        if kind.get_ref() == "scene" {
+            let k: SceneKeys = section.read(&["kind"])?;
+            return Ok(Data {
+                path: self.path("data.path", k.path, &span)?,
+                measurements: self.measurements(k.measurements)?,
+                reading: self.reading(k.keys, k.axes, k.scale)?,
+                simulate: None,
+            });
+        }
+        let mask = section.take("mask")?;
+        let k: SimulateKeys = section.read(&["kind", "mask"])?;
+        let mask = mask.ok_or_else(|| {
+            self.source.error(&span, "`data.mask` is missing: data.kind = \"simulate\" needs [data.mask]")
+        })?;
+        let mask = self.mask(mask, seed)?;
+        let noise = k.noise.unwrap_or(NoiseKeys { sigma: None, photons: None, seed: None });
+        Ok(Data {
+            path: self.path("data.path", k.path, &span)?,
+            measurements: self.measurements(k.measurements)?,
+            reading: self.reading(k.keys, k.axes, k.scale)?,
+            simulate: Some(Simulate {
+                mask,
+                sigma: self.number("data.noise.sigma", &noise.sigma, 0.0..=255.0)?.unwrap_or(0.0) as f32,
+                photons: self.number("data.noise.photons", &noise.photons, 1e-3..=1e9)?,
+                seed: self.whole("data.noise.seed", &noise.seed, SEEDS)?.map_or(seed, |s| s as u64),
+            }),
+        })
+    }
+
+    fn mask(&self, mut section: Section<'s>, seed: u64) -> Result<Mask, ConfigError> {
+        let span = section.span.clone();
+        let kind = section.take_kind(&["random", "shifting", "file"], None)?;
+        if kind.get_ref() == "file" {
+            let k: FileMaskKeys = section.read(&["kind"])?;
+            return Ok(Mask::File(self.path("data.mask.path", k.path, &span)?));
+        }
+        let k: RandomMaskKeys = section.read(&["kind"])?;
+        let random = RandomMask {
+            frames: self.whole("data.mask.frames", &k.frames, 2..=1024)?.unwrap_or(8) as usize,
+            density: self.number("data.mask.density", &k.density, 1e-3..=1.0)?.unwrap_or(0.5),
+            seed: self.whole("data.mask.seed", &k.seed, SEEDS)?.map_or(seed, |s| s as u64),
+        };
+        Ok(if kind.get_ref() == "random" { Mask::Random(random) } else { Mask::Shifting(random) })
+    }
+
+    fn measurements(&self, list: Option<Spanned<Vec<Spanned<i64>>>>) -> Result<Option<Vec<usize>>, ConfigError> {
+        let Some(list) = list else { return Ok(None) };
+        let legal = "a list of at least one measurement, each named once, counted from 0";
+        let mut indices = Vec::new();
+        for index in list.get_ref() {
+            match usize::try_from(*index.get_ref()) {
+                Ok(i) if !indices.contains(&i) => indices.push(i),
+                _ => return Err(self.value_error("data.measurements", &index.span(), legal)),
+            }
+        }
+        if indices.is_empty() {
+            return Err(self.value_error("data.measurements", &list.span(), legal));
+        }
+        Ok(Some(indices))
+    }
+
+    fn reading(
+        &self,
+        keys: Option<PartNames>,
+        axes: Option<Spanned<String>>,
+        scale: Option<Spanned<f64>>,
+    ) -> Result<Reading, ConfigError> {
+        let (names, default) = (keys.unwrap_or_default(), Keys::default());
+        Ok(Reading {
+            keys: Keys {
+                mask: names.mask.unwrap_or(default.mask),
+                meas: names.meas.unwrap_or(default.meas),
+                orig: names.orig.unwrap_or(default.orig),
+                rgb: names.rgb.unwrap_or(default.rgb),
+            },
+            axes: self.choice("data.axes", &axes, &[("hwt", Axes::Hwt), ("thw", Axes::Thw)])?,
+            scale: self.number("data.scale", &scale, 1e-6..=1e6)?.map(|s| s as f32),
+        })
+    }
+
+    fn solver(&self, mut section: Section<'s>) -> Result<(Solver, Start), ConfigError> {
+        let kind = section.take_kind(&["gap", "admm", "two-stage"], None)?;
+        match kind.get_ref().as_str() {
+            "gap" => {
+                let k: GapKeys = section.read(&["kind"])?;
+                let start = self.start(k.start, k.start_iterations, k.start_weight)?;
+                let accelerate = k.accelerate.as_ref().is_none_or(|a| *a.get_ref());
+                let legal = [("zero", Momentum::Zero), ("measurement", Momentum::Measurement)];
+                let momentum = self.choice("solver.momentum", &k.momentum, &legal)?;
+                if let (false, Some(m)) = (accelerate, &k.momentum) {
+                    return Err(self
+                        .source
+                        .error(&m.span(), "`solver.momentum` has no effect without solver.accelerate = true"));
+                }
+                let momentum = accelerate.then(|| momentum.unwrap_or(Momentum::Measurement));
+                Ok((Solver::Gap { momentum }, start))
+            }
+            "admm" => {
+                let k: AdmmKeys = section.read(&["kind"])?;
+                let start = self.start(k.start, k.start_iterations, k.start_weight)?;
+                let gamma = self.number("solver.gamma", &k.gamma, 0.0..=1e3)?.unwrap_or(0.01) as f32;
+                Ok((Solver::Admm { gamma }, start))
+            }
+            _ => Err(self.not_yet("solver.kind", &kind.span(), "gap, admm")),
+        }
+    }
+
+    fn start(
+        &self,
+        start: Option<Spanned<String>>,
+        iterations: Option<Spanned<i64>>,
+        weight: Option<Spanned<f64>>,
+    ) -> Result<Start, ConfigError> {
+        let count = self.whole("solver.start_iterations", &iterations, 1..=MAX_ITERATIONS)?.unwrap_or(20) as usize;
+        let tv_weight = self.number("solver.start_weight", &weight, 1e-6..=100.0)?.unwrap_or(0.1) as f32;
+        let tv = Start::Tv { iterations: count, weight: tv_weight };
+        let legal = [("mean", Start::Mean), ("adjoint", Start::Adjoint), ("previous", Start::Previous), ("tv", tv)];
+        let start = self.choice("solver.start", &start, &legal)?.unwrap_or(Start::Mean);
+        if !matches!(start, Start::Tv { .. }) {
+            let unused = [
+                ("solver.start_iterations", iterations.map(|s| s.span())),
+                ("solver.start_weight", weight.map(|s| s.span())),
+            ];
+            if let Some((key, Some(span))) = unused.into_iter().find(|(_, s)| s.is_some()) {
+                return Err(self.source.error(&span, format!("`{key}` has no effect without solver.start = \"tv\"")));
+            }
+        }
+        Ok(start)
+    }
+
+    fn stages(
+        &self,
+        default: Option<Section<'s>>,
+        sections: Vec<Section<'s>>,
+    ) -> Result<(Vec<Denoiser>, Vec<Stage>), ConfigError> {
+        if sections.is_empty() {
+            return Err(self.source.file_error("no [[stage]]: at least one is needed, for example iterations = 40"));
+        }
+        let mut denoisers = default.map(|d| self.denoiser(d)).transpose()?.into_iter().collect::<Vec<_>>();
+        let has_default = !denoisers.is_empty();
+        let mut stages = Vec::new();
+        for mut section in sections {
+            let (key, span) = (section.key.clone(), section.span.clone());
+            let denoiser = match section.take("denoiser")? {
+                Some(own) => {
+                    denoisers.push(self.denoiser(own)?);
+                    denoisers.len() - 1
+                }
+                None if has_default => 0,
+                None => {
+                    return Err(self
+                        .source
+                        .error(&span, format!("`{key}` has no denoiser, and there is no [denoiser] table")));
+                }
+            };
+            let k: StageKeys = section.read(&["denoiser"])?;
+            let sigma = self.number(&format!("{key}.sigma"), &k.sigma, 0.0..=255.0)?;
+            let iterations =
+                self.whole(&format!("{key}.iterations"), &k.iterations, 1..=MAX_ITERATIONS)?.ok_or_else(|| {
+                    self.source.error(&span, format!("`{key}.iterations` is missing; legal: 1 to {MAX_ITERATIONS}"))
+                })?;
+            let sigma = match (&denoisers[denoiser], sigma, &k.sigma) {
+                (Denoiser::Tv { .. }, Some(_), Some(given)) => {
+                    return Err(self.source.error(
+                        &given.span(),
+                        format!("`{key}.sigma` has no effect: its denoiser is tv, whose strength is denoiser.weight"),
+                    ));
+                }
+                (Denoiser::Tv { .. }, ..) => 0.0,
+                (_, Some(sigma), _) => sigma as f32,
+                (_, None, _) => {
+                    return Err(self.source.error(
+                        &span,
+                        format!("`{key}.sigma` is missing; legal: 0 to 255, in units of an 8-bit picture"),
+                    ));
+                }
+            };
+            stages.push(Stage { sigma, iterations: iterations as usize, denoiser });
+        }
+        if has_default && stages.iter().all(|s| s.denoiser != 0) {
+            return Err(self.source.file_error("[denoiser] has no effect: every [[stage]] names its own"));
+        }
+        Ok((denoisers, stages))
+    }
+
+    fn denoiser(&self, mut section: Section<'s>) -> Result<Denoiser, ConfigError> {
+        let (key, span) = (section.key.clone(), section.span.clone());
+        let kind = section.take_kind(&["tv", "ffdnet", "fastdvdnet", "wavelet", "wnnm"], None)?;
+        match kind.get_ref().as_str() {
+            "tv" => {
+                let k: TvKeys = section.read(&["kind"])?;
+                Ok(Denoiser::Tv {
+                    weight: self.number(&format!("{key}.weight"), &k.weight, 1e-6..=100.0)?.unwrap_or(0.3) as f32,
+                    inner: self.whole(&format!("{key}.inner"), &k.inner, 1..=1000)?.unwrap_or(5) as usize,
+                    warm_dual: k.warm_dual.is_some_and(|w| *w.get_ref()),
+                })
+            }
+            "ffdnet" => {
+                let k: NetKeys = section.read(&["kind"])?;
+                Ok(Denoiser::Ffdnet { weights: self.path(&format!("{key}.weights"), k.weights, &span)? })
+            }
+            _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, ffdnet")),
+        }
+    }
+
+    fn switched_off(&self, key: &str, section: Option<Section<'s>>) -> Result<(), ConfigError> {
+        let Some(section) = section else { return Ok(()) };
+        let k: SwitchKeys = section.read(&[])?;
+        match k.enabled {
+            Some(on) if *on.get_ref() => Err(self.not_yet(&format!("{key}.enabled"), &on.span(), "false")),
+            _ => Ok(()),
+        }
+    }
+
+    fn stop(&self, section: Option<Section<'s>>) -> Result<(f64, Option<f64>), ConfigError> {
+        let k: StopKeys = section.map(|s| s.read(&[])).transpose()?.unwrap_or_default();
+        Ok((
+            self.number("stop.relative_change", &k.relative_change, 0.0..=1.0)?.unwrap_or(0.0),
+            self.number("stop.seconds", &k.seconds, 1e-3..=1e6)?,
+        ))
+    }
+
+    fn output(&self, section: Option<Section<'s>>) -> Result<Output, ConfigError> {
+        let k: OutputKeys = section.map(|s| s.read(&[])).transpose()?.unwrap_or_default();
+        let formats = [("npy", OutputFormat::Npy), ("npz", OutputFormat::Npz), ("mat", OutputFormat::Mat)];
+        Ok(Output {
+            format: self.choice("output.format", &k.format, &formats)?.unwrap_or(OutputFormat::Npy),
+            frames: k.frames.is_none_or(|f| *f.get_ref()),
+            preview: k.preview.is_none_or(|p| *p.get_ref()),
+            fps: self.whole("output.fps", &k.fps, 1..=50)?.unwrap_or(10) as u16,
+        })
+    }
+
+    fn path(&self, key: &str, path: Option<Spanned<String>>, table: &Range<usize>) -> Result<PathSetting, ConfigError> {
+        match path {
+            Some(path) if !path.get_ref().is_empty() => {
+                Ok(PathSetting { key: key.into(), span: path.span(), text: path.into_inner() })
+            }
+            Some(path) => Err(self.value_error(key, &path.span(), "the path of a file or folder")),
+            None => Err(self.source.error(table, format!("`{key}` is missing; legal: the path of a file or folder"))),
+        }
+    }
+
+    fn whole(
+        &self,
+        key: &str,
+        value: &Option<Spanned<i64>>,
+        legal: RangeInclusive<i64>,
+    ) -> Result<Option<i64>, ConfigError> {
+        match value {
+            Some(v) if !legal.contains(v.get_ref()) => {
+                let legal = format!("a whole number from {} to {}", legal.start(), legal.end());
+                Err(self.value_error(key, &v.span(), &legal))
+            }
+            other => Ok(other.as_ref().map(|v| *v.get_ref())),
+        }
+    }
+
+    fn number(
+        &self,
+        key: &str,
+        value: &Option<Spanned<f64>>,
+        legal: RangeInclusive<f64>,
+    ) -> Result<Option<f64>, ConfigError> {
+        match value {
+            Some(v) if !legal.contains(v.get_ref()) => {
+                let unit = if key.ends_with("sigma") { ", in units of an 8-bit picture" } else { "" };
+                let legal = format!("a number from {} to {}{unit}", legal.start(), legal.end());
+                Err(self.value_error(key, &v.span(), &legal))
+            }
+            other => Ok(other.as_ref().map(|v| *v.get_ref())),
+        }
+    }
+
+    fn choice<T: Copy>(
+        &self,
+        key: &str,
+        value: &Option<Spanned<String>>,
+        legal: &[(&str, T)],
+    ) -> Result<Option<T>, ConfigError> {
+        let Some(v) = value else { return Ok(None) };
+        match legal.iter().find(|(name, _)| name == v.get_ref()) {
+            Some(&(_, choice)) => Ok(Some(choice)),
+            None => {
+                let names: Vec<&str> = legal.iter().map(|(name, _)| *name).collect();
+                Err(self.value_error(key, &v.span(), &names.join(", ")))
+            }
+        }
+    }
+
+    fn value_error(&self, key: &str, span: &Range<usize>, legal: &str) -> ConfigError {
+        self.source.error(span, format!("`{key}` = {} is not legal; legal: {legal}", self.source.snippet(span)))
+    }
+
+    fn not_yet(&self, key: &str, span: &Range<usize>, available: &str) -> ConfigError {
+        let value = self.source.snippet(span);
+        self.source.error(span, format!("`{key}` = {value} is not available yet; available: {available}"))
+    }
+}

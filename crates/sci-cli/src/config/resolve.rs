@@ -1,0 +1,365 @@
+//! Owns the last step: paths looked up, σ divided by 255, ready to run and to be written into the run record.
+
+use std::env;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use super::check::{self, Checked, Mask, Momentum, PathSetting};
+use super::source::{ConfigError, Place, Source};
+use crate::io::scene::{Axes, Reading};
+
+pub use super::check::{Output, OutputFormat, RandomMask, Solver, Start};
+
+/// The environment variable that names a folder of scenes and weights.
+pub const DATA_VARIABLE: &str = "SCI_DATA";
+/// Full scale of the σ written in TOML.
+const SIGMA_UNIT: f32 = 255.0;
+
+/// Where the measurements come from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Data {
+    /// The scene or video, absolute.
+    pub path: PathBuf,
+    /// Measurements to reconstruct, `None` for all.
+    pub measurements: Option<Vec<usize>>,
+    /// How to understand the file.
+    pub reading: Reading,
+    /// Set if `path` is a video whose measurements are simulated.
+    pub simulate: Option<Simulate>,
+}
+
+/// What turns a video into measurements.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Simulate {
+    /// The masks.
+    pub mask: MaskSource,
+    /// Standard deviation of Gaussian noise, in the unit of y (full scale 1).
+    pub sigma: f32,
+    /// Photons per unit of y, `None` for no shot noise.
+    pub photons: Option<f64>,
+    /// Seed of the noise.
+    pub seed: u64,
+}
+
+/// Where masks come from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum MaskSource {
+    /// Independent random pixels.
+    Random(RandomMask),
+    /// One random pattern, moved by a pixel a frame.
+    Shifting(RandomMask),
+    /// A file, absolute.
+    File(PathBuf),
+}
+
+/// A denoiser to build.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Denoiser {
+    /// Total variation.
+    Tv {
+        /// Weight.
+        weight: f32,
+        /// Dual steps a call.
+        inner: usize,
+        /// Keep the dual field between calls.
+        warm_dual: bool,
+    },
+    /// FFDNet.
+    Ffdnet {
+        /// Weight file, absolute.
+        weights: PathBuf,
+    },
+}
+
+impl Denoiser {
+    /// The `kind` that names it in TOML.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Tv { .. } => "tv",
+            Self::Ffdnet { .. } => "ffdnet",
+        }
+    }
+}
+
+/// A stage to run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stage {
+    /// σ in `[0, 1]`.
+    pub sigma: f32,
+    /// Iterations.
+    pub iterations: usize,
+    /// Index into [`Experiment::denoisers`].
+    pub denoiser: usize,
+}
+
+/// An experiment ready to run.
+#[derive(Clone, Debug)]
+pub struct Experiment {
+    /// Name, a relative path such as `gray/gap-tv`.
+    pub name: String,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Where the measurements come from.
+    pub data: Data,
+    /// The solver.
+    pub solver: Solver,
+    /// Where it starts.
+    pub start: Start,
+    /// All denoisers.
+    pub denoisers: Vec<Denoiser>,
+    /// The stages.
+    pub stages: Vec<Stage>,
+    /// Stop once the relative change is at most this; 0 never.
+    pub relative_change: f64,
+    /// Stop a measurement after so many seconds.
+    pub seconds: Option<f64>,
+    /// What to write.
+    pub output: Output,
+}
+
+/// Reads, checks and resolves an experiment file with `--set` arguments applied.
+///
+/// # Errors
+/// [`ConfigError`] naming the place, the key, the value and what is legal.
+pub fn load(path: &Path, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    let bytes = std::fs::read(path).map_err(|e| ConfigError {
+        place: Place::File(path.to_owned()),
+        problem: format!("cannot read the experiment file: {e}"),
+    })?;
+    let text = String::from_utf8(bytes)
+        .map_err(|_| ConfigError { place: Place::File(path.to_owned()), problem: "not a text file".into() })?;
+    let source = Source::new(path, &text, arguments);
+    let checked = check::check(&source)?;
+    resolve(checked, &source)
+}
+
+fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError> {
+    let find = |setting: &PathSetting| locate(setting, source);
+    let simulate = match &checked.data.simulate {
+        None => None,
+        Some(s) => Some(Simulate {
+            mask: match &s.mask {
+                Mask::Random(r) => MaskSource::Random(r.clone()),
+                Mask::Shifting(r) => MaskSource::Shifting(r.clone()),
+                Mask::File(p) => MaskSource::File(find(p)?),
+            },
+            sigma: s.sigma / SIGMA_UNIT,
+            photons: s.photons,
+            seed: s.seed,
+        }),
+    };
+    let data = Data {
+        path: find(&checked.data.path)?,
+        measurements: checked.data.measurements,
+        reading: checked.data.reading,
+        simulate,
+    };
+    let denoisers = checked
+        .denoisers
+        .iter()
+        .map(|d| match d {
+            check::Denoiser::Tv { weight, inner, warm_dual } => {
+                Ok(Denoiser::Tv { weight: *weight, inner: *inner, warm_dual: *warm_dual })
+            }
+            check::Denoiser::Ffdnet { weights } => Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)? }),
+        })
+        .collect::<Result<_, ConfigError>>()?;
+    let stages = checked
+        .stages
+        .iter()
+        .map(|s| Stage { sigma: s.sigma / SIGMA_UNIT, iterations: s.iterations, denoiser: s.denoiser })
+        .collect();
+    let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
+    Ok(Experiment {
+        name: checked.name.unwrap_or_else(stem),
+        seed: checked.seed,
+        data,
+        solver: checked.solver,
+        start: checked.start,
+        denoisers,
+        stages,
+        relative_change: checked.relative_change,
+        seconds: checked.seconds,
+        output: checked.output,
+    })
+}
+
+/// The folders a relative path is looked up in.
+fn search_folders(setting: &PathSetting, source: &Source) -> Vec<PathBuf> {
+    let here = || PathBuf::from(".");
+    let first = if source.is_set(&setting.span) {
+        here()
+    } else {
+        source.path().parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(here, Path::to_owned)
+    };
+    let mut folders = vec![first];
+    if let Some(data) = env::var_os(DATA_VARIABLE).filter(|v| !v.is_empty()).map(PathBuf::from) {
+        folders.extend([data.clone(), data.join("data"), data.join("weights")]);
+    }
+    folders
+}
+
+fn locate(setting: &PathSetting, source: &Source) -> Result<PathBuf, ConfigError> {
+    let folders = search_folders(setting, source);
+    // Joining an absolute path gives that path, whatever the folder.
+    if let Some(found) = folders.iter().map(|f| f.join(&setting.text)).find(|p| p.exists()) {
+        return std::path::absolute(&found)
+            .map_err(|e| source.error(&setting.span, format!("`{}` = {:?}: {e}", setting.key, setting.text)));
+    }
+    let mut problem = format!("`{}` = {:?}: no such file or folder", setting.key, setting.text);
+    if Path::new(&setting.text).is_relative() {
+        let looked: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
+        problem += &format!("; looked in {}", looked.join(", "));
+        if folders.len() == 1 {
+            problem += &format!(" ({DATA_VARIABLE} is not set: it may name a folder with data/ and weights/)");
+        }
+    }
+    Err(source.error(&setting.span, problem))
+}
+
+/// Published weight files by the name under which configs know them: what it is and where it comes from.
+const PUBLISHED: [(&str, &str); 3] = [
+    (
+        "ffdnet_gray_ipol.pth",
+        "the gray FFDNet of Tassano, Delon and Veit (IPOL 2019), published as models/net_gray.pth at https://github.com/m-tassano/ffdnet",
+    ),
+    (
+        "ffdnet_gray.pth",
+        "the gray FFDNet of Zhang et al., published as ffdnet_gray.pth at https://github.com/cszn/KAIR/releases/tag/v1.0",
+    ),
+    (
+        "ffdnet_color.pth",
+        "the color FFDNet of Zhang et al., published as ffdnet_color.pth at https://github.com/cszn/KAIR/releases/tag/v1.0",
+    ),
+];
+
+fn locate_weights(setting: &PathSetting, source: &Source) -> Result<PathBuf, ConfigError> {
+    if let Some(name) = setting.text.strip_prefix("bundled:") {
+        let known = nets::weights::bundled_names();
+        if known.contains(&name) {
+            return Ok(PathBuf::from(&setting.text));
+        }
+        let legal: Vec<String> = known.iter().map(|n| format!("bundled:{n}")).collect();
+        let legal = if legal.is_empty() {
+            "no weights are bundled yet".to_owned()
+        } else {
+            format!("bundled are {}", legal.join(", "))
+        };
+        return Err(source.error(
+            &setting.span,
+            format!("`{}` = {:?} is not legal: {legal}; name a .pth or .safetensors file", setting.key, setting.text),
+        ));
+    }
+    locate(setting, source).map_err(|mut error| {
+        let name = Path::new(&setting.text).file_name().unwrap_or_default();
+        if let Some((name, what)) = PUBLISHED.iter().find(|(n, _)| *n == name) {
+            let folder = search_folders(setting, source).remove(0);
+            error.problem += &format!(
+                ". It is {what}; save it as {} or as weights/{name} in the folder {DATA_VARIABLE} names",
+                folder.join(name).display()
+            );
+        }
+        error
+    })
+}
+
+impl Experiment {
+    /// The file or folder name of the data, as the run record's `scene`.
+    pub fn scene_name(&self) -> String {
+        self.data
+            .path
+            .file_name()
+            .map_or_else(|| self.data.path.display().to_string(), |n| n.to_string_lossy().into_owned())
+    }
+
+    /// The solver's `kind`.
+    pub fn solver_kind(&self) -> &'static str {
+        match self.solver {
+            Solver::Gap { .. } => "gap",
+            Solver::Admm { .. } => "admm",
+        }
+    }
+
+    /// The denoisers' kinds in the order of the stages, repeated ones once, joined by `+`.
+    pub fn denoiser_kinds(&self) -> String {
+        let mut kinds: Vec<&str> = self.stages.iter().map(|s| self.denoisers[s.denoiser].kind()).collect();
+        kinds.dedup();
+        kinds.join("+")
+    }
+
+    /// The resolved experiment for the run record, with the keys of the TOML; σ in `[0, 1]`, paths absolute.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "name": self.name,
+            "seed": self.seed,
+            "data": self.data_json(),
+            "solver": self.solver_json(),
+            "denoisers": self.denoisers.iter().map(denoiser_json).collect::<Vec<_>>(),
+            "stage": self.stages.iter()
+                .map(|s| json!({ "sigma": s.sigma, "iterations": s.iterations, "denoiser": s.denoiser }))
+                .collect::<Vec<_>>(),
+            "stop": { "relative_change": self.relative_change, "seconds": self.seconds },
+            "skip": { "enabled": false },
+            "online": { "enabled": false },
+            "output": {
+                "format": match self.output.format { OutputFormat::Npy => "npy", OutputFormat::Npz => "npz", OutputFormat::Mat => "mat" },
+                "frames": self.output.frames, "preview": self.output.preview, "fps": self.output.fps,
+            },
+        })
+    }
+
+    fn data_json(&self) -> Value {
+        let (d, k) = (&self.data, &self.data.reading.keys);
+        let axes = d.reading.axes.map(|a| if a == Axes::Hwt { "hwt" } else { "thw" });
+        let mut value = json!({
+            "kind": if d.simulate.is_some() { "simulate" } else { "scene" },
+            "path": d.path,
+            "measurements": d.measurements,
+            "keys": { "mask": k.mask, "meas": k.meas, "orig": k.orig, "rgb": k.rgb },
+            "axes": axes,
+            "scale": d.reading.scale,
+        });
+        if let Some(s) = &d.simulate {
+            let random = |kind, r: &RandomMask| json!({ "kind": kind, "frames": r.frames, "density": r.density, "seed": r.seed });
+            value["mask"] = match &s.mask {
+                MaskSource::Random(r) => random("random", r),
+                MaskSource::Shifting(r) => random("shifting", r),
+                MaskSource::File(path) => json!({ "kind": "file", "path": path }),
+            };
+            value["noise"] = json!({ "sigma": s.sigma, "photons": s.photons, "seed": s.seed });
+        }
+        value
+    }
+
+    fn solver_json(&self) -> Value {
+        let mut value = match self.solver {
+            Solver::Gap { momentum } => json!({
+                "kind": "gap",
+                "accelerate": momentum.is_some(),
+                "momentum": momentum.map(|m| if m == Momentum::Zero { "zero" } else { "measurement" }),
+            }),
+            Solver::Admm { gamma } => json!({ "kind": "admm", "gamma": gamma }),
+        };
+        value["start"] = match self.start {
+            Start::Mean => "mean".into(),
+            Start::Adjoint => "adjoint".into(),
+            Start::Previous => "previous".into(),
+            Start::Tv { iterations, weight } => {
+                value["start_iterations"] = iterations.into();
+                value["start_weight"] = weight.into();
+                "tv".into()
+            }
+        };
+        value
+    }
+}
+
+fn denoiser_json(d: &Denoiser) -> Value {
+    match d {
+        Denoiser::Tv { weight, inner, warm_dual } => {
+            json!({ "kind": "tv", "weight": weight, "inner": inner, "warm_dual": warm_dual })
+        }
+        Denoiser::Ffdnet { weights } => json!({ "kind": "ffdnet", "weights": weights }),
+    }
+}

@@ -1,0 +1,205 @@
+//! Owns folders of PNG frames: one file a frame, in the natural order of their names.
+
+use std::fs;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use image::{DynamicImage, ImageBuffer, ImageDecoder, Limits, Luma, Rgb, codecs::png::PngDecoder};
+use ndarray::ArrayView3;
+
+use super::samples::{Array, Budget, SampleType, Samples};
+use super::{FileError, ReadError, read_file};
+
+/// The `.png` files of a folder, `frame2.png` before `frame10.png`.
+///
+/// # Errors
+/// The folder's own error, or [`ReadError::NoFrames`] if it holds none.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    let io = |source| FileError::new(folder, ReadError::Io(source));
+    let mut paths = Vec::new();
+    for entry in fs::read_dir(folder).map_err(io)? {
+        let path = entry.map_err(io)?.path();
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
+            paths.push(path);
+        }
+    }
+    if paths.is_empty() {
+        return Err(FileError::new(folder, ReadError::NoFrames));
+    }
+    paths.sort_by_cached_key(|p| natural_key(&p.file_name().unwrap_or_default().to_string_lossy()));
+    Ok(paths)
+}
+
+/// Text with its digit runs as numbers, so that 2 sorts before 10.
+fn natural_key(name: &str) -> Vec<(String, u64)> {
+    let mut key = vec![(String::new(), 0u64)];
+    let mut in_digits = false;
+    for c in name.chars() {
+        let last = key.len() - 1;
+        match c.to_digit(10) {
+            Some(d) => {
+                key[last].1 = key[last].1.saturating_mul(10).saturating_add(u64::from(d));
+                in_digits = true;
+            }
+            None if in_digits => {
+                key.push((c.to_string(), 0));
+                in_digits = false;
+            }
+            None => key[last].0.push(c),
+        }
+    }
+    key
+}
+
+/// Reads a folder of equally large PNGs as a video `[T, C, H, W]`, C = 1 if every frame is gray, else 3.
+///
+/// Samples are 0 to 255 for 8-bit files and 0.0 to 1.0 for 16-bit ones; transparency is dropped.
+///
+/// # Errors
+/// [`FileError`] naming the folder or the frame at fault.
+pub fn read(folder: &Path) -> Result<Array, FileError> {
+    let paths = list(folder)?;
+    let mut images = Vec::with_capacity(paths.len());
+    for path in &paths {
+        let image = decode_png(&read_file(path)?).map_err(|e| FileError::new(path, e))?;
+        if let Some(first) = images.first().map(|i: &DynamicImage| (i.width(), i.height())) {
+            let size = (image.width(), image.height());
+            if size != first {
+                return Err(FileError::new(
+                    path,
+                    ReadError::Malformed {
+                        format: "frame",
+                        reason: format!(
+                            "{}×{} pixels, but the first frame has {}×{}",
+                            size.0, size.1, first.0, first.1
+                        ),
+                    },
+                ));
+            }
+        }
+        images.push(image);
+    }
+    to_video(&images).map_err(|e| FileError::new(folder, e))
+}
+
+/// Decodes one PNG, within the budget of its own size.
+///
+/// # Errors
+/// [`ReadError::Malformed`] for broken bytes or an image too large for its file.
+pub fn decode_png(bytes: &[u8]) -> Result<DynamicImage, ReadError> {
+    let broken = |e: image::ImageError| ReadError::Malformed { format: ".png", reason: e.to_string() };
+    let mut limits = Limits::default();
+    let limit = Budget::for_file(bytes.len()).left();
+    limits.max_alloc = Some(limit as u64);
+    let decoder = PngDecoder::with_limits(Cursor::new(bytes), limits).map_err(broken)?;
+    let needed = usize::try_from(decoder.total_bytes()).unwrap_or(usize::MAX);
+    if needed > limit {
+        return Err(ReadError::TooLarge { needed, limit });
+    }
+    DynamicImage::from_decoder(decoder).map_err(broken)
+}
+
+fn to_video(images: &[DynamicImage]) -> Result<Array, ReadError> {
+    let gray = images.iter().all(|i| !i.color().has_color());
+    let deep = images.iter().any(|i| i.color().bytes_per_pixel() / i.color().channel_count() > 1);
+    let channels = if gray { 1 } else { 3 };
+    let (w, h) = images.first().map_or((0, 0), |i| (i.width() as usize, i.height() as usize));
+    let shape = vec![images.len(), channels, h, w];
+    if deep {
+        let mut v: Vec<f32> = Vec::new();
+        for image in images {
+            if gray {
+                v.extend(image.to_luma16().as_raw().iter().map(|&s| f32::from(s) / 65535.0));
+            } else {
+                let raw = image.to_rgb16().into_raw();
+                (0..3).for_each(|c| v.extend(raw.iter().skip(c).step_by(3).map(|&s| f32::from(s) / 65535.0)));
+            }
+        }
+        Array::new(shape, Samples::Floats(v), SampleType::F32)
+    } else {
+        let mut v: Vec<u8> = Vec::new();
+        for image in images {
+            if gray {
+                v.extend(image.to_luma8().into_raw());
+            } else {
+                push_planes(&mut v, &image.to_rgb8().into_raw(), 3);
+            }
+        }
+        Array::new(shape, Samples::Bytes(v), SampleType::U8)
+    }
+}
+
+/// Appends interleaved pixels of `stride` channels as three planes.
+pub(super) fn push_planes(out: &mut Vec<u8>, interleaved: &[u8], stride: usize) {
+    for c in 0..3 {
+        out.extend(interleaved.iter().skip(c).step_by(stride));
+    }
+}
+
+/// A sample of `[0, 1]` as a byte, rounded, clipped; NaN becomes 0.
+pub fn to_byte(x: f32) -> u8 {
+    (x.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// Writes one frame `[C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as an 8-bit PNG.
+///
+/// # Errors
+/// The encoder's or the file's error.
+pub fn write_png(path: &Path, frame: ArrayView3<'_, f32>) -> image::ImageResult<()> {
+    let (c, h, w) = frame.dim();
+    let at = |c, x: u32, y: u32| to_byte(frame[[c, y as usize, x as usize]]);
+    if c == 1 {
+        ImageBuffer::from_fn(w as u32, h as u32, |x, y| Luma([at(0, x, y)])).save(path)
+    } else {
+        ImageBuffer::from_fn(w as u32, h as u32, |x, y| Rgb([at(0, x, y), at(1, x, y), at(2, x, y)])).save(path)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array3;
+
+    #[test]
+    fn folder_round_trip_in_natural_order() {
+        let dir = tempfile::tempdir().unwrap();
+        for t in [0usize, 2, 10] {
+            let frame = Array3::from_elem((1, 3, 4), t as f32 / 255.0);
+            write_png(&dir.path().join(format!("f{t}.png")), frame.view()).unwrap();
+        }
+        let video = read(dir.path()).unwrap();
+        assert_eq!(video.shape(), [3, 1, 3, 4]);
+        assert_eq!([0, 12, 24].map(|i| video.samples().at(i)), [0.0, 2.0, 10.0]);
+    }
+
+    #[test]
+    fn color_frames_become_planes() {
+        let dir = tempfile::tempdir().unwrap();
+        let frame = Array3::from_shape_fn((3, 2, 2), |(c, _, _)| [0.0, 0.2, 1.0][c]);
+        write_png(&dir.path().join("a.png"), frame.view()).unwrap();
+        let video = read(dir.path()).unwrap();
+        assert_eq!(video.shape(), [1, 3, 2, 2]);
+        assert_eq!(video.samples(), &Samples::Bytes(vec![0, 0, 0, 0, 51, 51, 51, 51, 255, 255, 255, 255]));
+    }
+
+    #[test]
+    fn an_empty_folder_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = read(dir.path()).unwrap_err();
+        assert!(matches!(error.source, ReadError::NoFrames), "{error}");
+    }
+
+    #[test]
+    fn damaged_png_bytes_give_errors() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        write_png(&path, Array3::from_elem((1, 5, 7), 0.5).view()).unwrap();
+        let bytes = fs::read(&path).unwrap();
+        for at in 0..bytes.len() {
+            let mut b = bytes.clone();
+            b[at] ^= 0xff;
+            let _ = decode_png(&b);
+            assert!(decode_png(&bytes[..at]).is_err() || at > bytes.len() - 16);
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! Owns NumPy's `.npy` and `.npz`.
+//!
+//! Writing goes through `ndarray-npy`. Reading does not: that crate allocates what a header declares before it looks at
+//! how many bytes follow, and needs the number type to be known beforehand. The header is one line of three keys.
+//!
+//! Source: the `.npy` format, versions 1.0 to 3.0, `numpy.lib.format`.
+
+use std::io::{Cursor, Read, Seek, Write};
+
+use ndarray::{ArrayViewD, Data, Dimension};
+use ndarray_npy::{NpzWriter, WriteNpyError, WriteNpyExt, WriteNpzError};
+
+use super::samples::{Array, Budget, Endian, SampleType, Samples, element_count};
+use super::{NamedArrays, ReadError};
+
+const MAGIC: &[u8] = b"\x93NUMPY";
+const FORMAT: &str = ".npy";
+/// Longest header accepted; NumPy's own limit is 10 000 characters.
+const MAX_HEADER: usize = 10_000;
+
+/// Whether the bytes open like an `.npy` file.
+pub fn is_npy(bytes: &[u8]) -> bool {
+    bytes.starts_with(MAGIC)
+}
+
+/// Whether the bytes open like an `.npz` file (a zip archive).
+pub fn is_npz(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(b"PK\x05\x06")
+}
+
+fn bad(reason: impl Into<String>) -> ReadError {
+    ReadError::Malformed { format: FORMAT, reason: reason.into() }
+}
+
+/// Reads one array of any real number type, either byte order, C or Fortran order.
+///
+/// # Errors
+/// [`ReadError`] if the header is not a NumPy header, the type is not a real number, or fewer bytes follow than the
+/// shape needs.
+pub fn read_npy(bytes: &[u8]) -> Result<Array, ReadError> {
+    read_npy_within(bytes, &mut Budget::for_file(bytes.len()))
+}
+
+fn read_npy_within(bytes: &[u8], budget: &mut Budget) -> Result<Array, ReadError> {
+    let (header, data) = split_header(bytes)?;
+    let (stored, endian) = sample_type(quoted(header, "descr")?)?;
+    let fortran = match after(header, "fortran_order")? {
+        s if s.starts_with("True") => true,
+        s if s.starts_with("False") => false,
+        _ => return Err(bad("`fortran_order` is neither True nor False")),
+    };
+    let shape = shape(header)?;
+    let count = element_count(&shape).ok_or_else(|| bad(format!("shape {shape:?} overflows")))?;
+    let needed = count.checked_mul(stored.size()).filter(|&n| n <= data.len());
+    let Some(needed) = needed else {
+        return Err(bad(format!(
+            "cut short: shape {shape:?} of {}-byte samples, but {} bytes of data",
+            stored.size(),
+            data.len()
+        )));
+    };
+    budget.claim(count, stored.decoded_size())?;
+    let samples = Samples::decode(data[..needed].to_vec(), stored, endian);
+    let samples = if fortran { to_row_major(&samples, &shape) } else { samples };
+    Array::new(shape, samples, stored)
+}
+
+fn split_header(bytes: &[u8]) -> Result<(&str, &[u8]), ReadError> {
+    let short = || bad("cut short inside its header");
+    if !is_npy(bytes) {
+        return Err(bad("does not begin with the NumPy magic bytes"));
+    }
+    let (len, start) = match bytes.get(6).ok_or_else(short)? {
+        1 => {
+            (usize::from(u16::from_le_bytes([*bytes.get(8).ok_or_else(short)?, *bytes.get(9).ok_or_else(short)?])), 10)
+        }
+        2 | 3 => {
+            let b = bytes.get(8..12).ok_or_else(short)?;
+            (u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize, 12)
+        }
+        v => return Err(bad(format!("version {v}, known are 1 to 3"))),
+    };
+    if len > MAX_HEADER {
+        return Err(bad(format!("header of {len} bytes, at most {MAX_HEADER} are accepted")));
+    }
+    let header = bytes.get(start..start + len).ok_or_else(short)?;
+    let header = std::str::from_utf8(header).map_err(|_| bad("header is not text"))?;
+    Ok((header, &bytes[start + len..]))
+}
+
+/// What follows `'key':` in the header's dictionary.
+fn after<'a>(header: &'a str, key: &str) -> Result<&'a str, ReadError> {
+    let missing = || bad(format!("header without `{key}`"));
+    let at = header.find(&format!("'{key}'")).ok_or_else(missing)?;
+    let rest = header[at + key.len() + 2..].trim_start();
+    Ok(rest.strip_prefix(':').ok_or_else(missing)?.trim_start())
+}
+
+fn quoted<'a>(header: &'a str, key: &str) -> Result<&'a str, ReadError> {
+    after(header, key)?
+        .strip_prefix('\'')
+        .and_then(|s| s.split('\'').next())
+        .ok_or_else(|| bad(format!("`{key}` is not a plain type; record arrays are not supported")))
+}
+
+fn shape(header: &str) -> Result<Vec<usize>, ReadError> {
+    let inner = after(header, "shape")?
+        .strip_prefix('(')
+        .and_then(|s| s.split_once(')'))
+        .ok_or_else(|| bad("`shape` is not a tuple"))?
+        .0;
+    inner
+        .split(',')
+        .map(str::trim)
+        .filter(|s| !s.is_empty())
+        .map(|s| s.parse().map_err(|_| bad(format!("`shape` has the length {s:?}"))))
+        .collect()
+}
+
+fn sample_type(descr: &str) -> Result<(SampleType, Endian), ReadError> {
+    let unsupported =
+        || bad(format!("samples of type {descr:?}; supported are bool, integers and 4- or 8-byte floats"));
+    let (endian, code) = match descr.split_at_checked(1) {
+        Some(("<" | "|" | "=", code)) => (Endian::Little, code),
+        Some((">", code)) => (Endian::Big, code),
+        _ => return Err(unsupported()),
+    };
+    let stored = match code {
+        "b1" | "u1" => SampleType::U8,
+        "i1" => SampleType::I8,
+        "i2" => SampleType::I16,
+        "u2" => SampleType::U16,
+        "i4" => SampleType::I32,
+        "u4" => SampleType::U32,
+        "i8" => SampleType::I64,
+        "u8" => SampleType::U64,
+        "f4" => SampleType::F32,
+        "f8" => SampleType::F64,
+        _ => return Err(unsupported()),
+    };
+    Ok((stored, endian))
+}
+
+fn to_row_major(samples: &Samples, shape: &[usize]) -> Samples {
+    use ndarray::{ArrayView, IxDyn, ShapeBuilder};
+    fn reorder<T: Copy>(v: &[T], shape: &[usize]) -> Vec<T> {
+        ArrayView::from_shape(IxDyn(shape).f(), v)
+            .expect("the caller decoded exactly as many samples as the shape holds")
+            .iter()
+            .copied()
+            .collect()
+    }
+    match samples {
+        Samples::Bytes(v) => Samples::Bytes(reorder(v, shape)),
+        Samples::Floats(v) => Samples::Floats(reorder(v, shape)),
+    }
+}
+
+/// Reads the arrays named in `wanted` from an `.npz` (others are only listed).
+///
+/// # Errors
+/// [`ReadError`] for a broken archive, a broken member, or one that would inflate beyond the file's budget.
+pub fn read_npz(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError> {
+    let broken = |e: &dyn std::fmt::Display| ReadError::Malformed { format: ".npz", reason: e.to_string() };
+    let mut budget = Budget::for_file(bytes.len());
+    let mut zip = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| broken(&e))?;
+    let mut found = NamedArrays::default();
+    for index in 0..zip.len() {
+        let member = zip.by_index(index).map_err(|e| broken(&e))?;
+        let name = member.name().trim_end_matches(".npy").to_owned();
+        found.names.push(name.clone());
+        if !wanted.contains(&name.as_str()) {
+            continue;
+        }
+        let limit = budget.left();
+        let mut raw = Vec::new();
+        member.take(limit as u64 + 1).read_to_end(&mut raw).map_err(|e| broken(&format!("`{name}`: {e}")))?;
+        if raw.len() > limit {
+            return Err(ReadError::TooLarge { needed: raw.len(), limit });
+        }
+        let array = read_npy_within(&raw, &mut budget).map_err(|e| match e {
+            ReadError::Malformed { reason, .. } => broken(&format!("`{name}`: {reason}")),
+            other => other,
+        })?;
+        found.arrays.insert(name, array);
+    }
+    Ok(found)
+}
+
+/// Writes one array as `.npy`.
+///
+/// # Errors
+/// The writer's error.
+pub fn write_npy<S, D>(w: &mut impl Write, array: &ndarray::ArrayBase<S, D>) -> Result<(), WriteNpyError>
+where
+    S: Data<Elem = f32>,
+    D: Dimension,
+{
+    array.write_npy(w)
+}
+
+/// Writes named arrays as a compressed `.npz`.
+///
+/// # Errors
+/// The writer's error.
+pub fn write_npz(w: impl Write + Seek, arrays: &[(&str, ArrayViewD<'_, f32>)]) -> Result<(), WriteNpzError> {
+    let mut npz = NpzWriter::new_compressed(w);
+    for (name, array) in arrays {
+        npz.add_array(*name, array)?;
+    }
+    npz.finish()?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{Array3, ShapeBuilder};
+
+    fn ramp() -> Array3<f32> {
+        Array3::from_shape_fn((2, 3, 4), |(t, y, x)| (100 * t + 10 * y + x) as f32)
+    }
+
+    #[test]
+    fn npy_round_trip_in_both_orders() {
+        let mut fortran = Array3::zeros((2, 3, 4).f());
+        fortran.assign(&ramp());
+        for array in [ramp(), fortran] {
+            let mut bytes = Vec::new();
+            write_npy(&mut bytes, &array).unwrap();
+            let read = read_npy(&bytes).unwrap();
+            assert_eq!(read.shape(), [2, 3, 4]);
+            let expected: Vec<f32> = ramp().iter().copied().collect();
+            assert_eq!(read.samples(), &Samples::Floats(expected));
+        }
+    }
+
+    #[test]
+    fn npz_round_trip_reads_only_what_is_wanted() {
+        let mut bytes = Cursor::new(Vec::new());
+        let (a, b) = (ramp().into_dyn(), ramp().into_dyn() * 2.0);
+        write_npz(&mut bytes, &[("mask", a.view()), ("meas", b.view())]).unwrap();
+        let found = read_npz(bytes.get_ref(), &["meas"]).unwrap();
+        assert_eq!(found.names, ["mask", "meas"]);
+        assert_eq!(found.arrays["meas"].samples().at(23), 246.0);
+        assert_eq!(found.arrays.len(), 1);
+    }
+
+    #[test]
+    fn hostile_bytes_give_errors() {
+        let mut bytes = Vec::new();
+        write_npy(&mut bytes, &ramp()).unwrap();
+        for len in 0..bytes.len() {
+            assert!(read_npy(&bytes[..len]).is_err(), "{len} bytes");
+        }
+        for at in 0..160 {
+            for value in [0, b'9', b'(', 0x80, 0xff] {
+                let mut b = bytes.clone();
+                b[at] = value;
+                let _ = read_npy(&b);
+            }
+        }
+        let mut forged = MAGIC.to_vec();
+        forged.extend([1, 0, 70, 0]);
+        forged
+            .extend(format!("{:70}", "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999, 9), }").bytes());
+        let error = read_npy(&forged).unwrap_err().to_string();
+        assert!(error.contains("cut short"), "{error}");
+    }
+
+    #[test]
+    fn damaged_archives_give_errors() {
+        let mut bytes = Cursor::new(Vec::new());
+        let a = ramp().into_dyn();
+        write_npz(&mut bytes, &[("mask", a.view())]).unwrap();
+        let bytes = bytes.into_inner();
+        for len in 0..bytes.len() {
+            assert!(read_npz(&bytes[..len], &["mask"]).is_err(), "{len} bytes");
+        }
+        for at in 0..bytes.len() {
+            let mut b = bytes.clone();
+            b[at] ^= 0xff;
+            let _ = read_npz(&b, &["mask"]);
+        }
+    }
+}

@@ -1,0 +1,619 @@
+//! Owns the step from files to a scene: which array plays which part, its axes, its scale, and whether all fit together.
+//!
+//! A scene is masks, measurements and, if known, the truth; all in the layouts and units of the library: `[T, H, W]`,
+//! frames in `[0, 1]`, measurements up to `Σ_t C_t`.
+
+use std::path::Path;
+
+use ndarray::{Array3, ArrayD, ArrayView2, ArrayView3, Axis, Ix3, IxDyn, s};
+use sci_forward::{MaskError, MaskOperator, MaskStack, SensingOperator};
+
+use super::samples::{Array, SampleType, Samples};
+use super::{FileError, Format, NamedArrays, ReadError, frames, mat, npy, read_file, read_video};
+
+/// The names under which a file holds the parts of a scene.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Keys {
+    /// Masks `[B, H, W]`.
+    pub mask: String,
+    /// Measurements `[N, H, W]`.
+    pub meas: String,
+    /// Gray (or mosaic) truth `[T, H, W]`.
+    pub orig: String,
+    /// Color truth `[T, H, W, 3]`.
+    pub rgb: String,
+}
+
+impl Default for Keys {
+    fn default() -> Self {
+        Self { mask: "mask".into(), meas: "meas".into(), orig: "orig".into(), rgb: "rgb".into() }
+    }
+}
+
+impl Keys {
+    fn all(&self) -> [&str; 4] {
+        [&self.mask, &self.meas, &self.orig, &self.rgb]
+    }
+}
+
+/// The order of a three-axis array in its file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Axes {
+    /// Rows, columns, frames: MATLAB's habit.
+    Hwt,
+    /// Frames, rows, columns: NumPy's habit.
+    Thw,
+}
+
+/// How to understand a scene file; `None` means by the file's format.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Reading {
+    /// Names of the parts.
+    pub keys: Keys,
+    /// Order of axes: `hwt` for .mat, `thw` otherwise.
+    pub axes: Option<Axes>,
+    /// What white is in the file: 255 for .mat and for whole numbers, 1 for floats of the other formats.
+    pub scale: Option<f32>,
+}
+
+/// Why files do not make a scene.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SceneError {
+    /// A file cannot be read.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A needed part is missing.
+    #[error("{file}: no variable `{key}` ({part}); it holds {}. Set data.keys if it has another name", list(.present))]
+    MissingKey {
+        /// The file.
+        file: String,
+        /// The name looked for.
+        key: String,
+        /// What it is for.
+        part: &'static str,
+        /// The names in the file.
+        present: Vec<String>,
+    },
+    /// Only color truth, which no solver can use yet.
+    #[error("{file}: a color scene (`{key}`, no gray `orig` or `meas`): color reconstruction is not available yet")]
+    ColorOnly {
+        /// The file.
+        file: String,
+        /// The color variable.
+        key: String,
+    },
+    /// An array with the wrong number of axes.
+    #[error("{file}: `{key}` has shape {shape:?}, expected {expected}")]
+    Axes {
+        /// The file.
+        file: String,
+        /// The variable.
+        key: String,
+        /// Its shape.
+        shape: Vec<usize>,
+        /// The legal shapes.
+        expected: &'static str,
+    },
+    /// Two arrays of different picture sizes.
+    #[error("{file}: `{key}` is {}×{} (rows × columns), but `{mask}` is {}×{}; they must be equal", .size.0, .size.1, .mask_size.0, .mask_size.1)]
+    SizeMismatch {
+        /// The file.
+        file: String,
+        /// The variable.
+        key: String,
+        /// Its rows and columns.
+        size: (usize, usize),
+        /// The mask variable.
+        mask: String,
+        /// The mask's rows and columns.
+        mask_size: (usize, usize),
+    },
+    /// NaN or infinity.
+    #[error("{file}: `{key}` is {value} at frame {frame}, row {row}, column {column}; every value must be finite")]
+    NotFinite {
+        /// The file.
+        file: String,
+        /// The variable.
+        key: String,
+        /// The value.
+        value: f32,
+        /// Position.
+        frame: usize,
+        /// Position.
+        row: usize,
+        /// Position.
+        column: usize,
+    },
+    /// Masks that are no masks.
+    #[error("{file}: `{key}`: {source}")]
+    Mask {
+        /// The file.
+        file: String,
+        /// The variable.
+        key: String,
+        /// The broken rule.
+        source: MaskError,
+    },
+    /// Fewer frames than masks, so nothing to sum.
+    #[error("{file}: {frames} frames, but a measurement sums {needed}")]
+    TooFewFrames {
+        /// The file.
+        file: String,
+        /// Frames there.
+        frames: usize,
+        /// Frames a measurement needs.
+        needed: usize,
+    },
+    /// A video where a scene is expected.
+    #[error(
+        "{file}: {what} has no masks and measurements. To simulate measurements from it, set data.kind = \"simulate\""
+    )]
+    NotAScene {
+        /// The file.
+        file: String,
+        /// What it is.
+        what: &'static str,
+    },
+}
+
+fn list(names: &[String]) -> String {
+    if names.is_empty() {
+        return "no variables".into();
+    }
+    names.iter().map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ")
+}
+
+/// Masks, measurements and truth that fit together.
+#[derive(Clone, Debug)]
+pub struct Scene {
+    /// C `[B, H, W]` as an operator.
+    pub operator: MaskOperator,
+    /// y `[N, H, W]`, up to `Σ_t C_t`.
+    pub measurements: Array3<f32>,
+    /// x `[T, H, W]` in `[0, 1]`; frame `k·B + t` belongs to measurement k.
+    pub truth: Option<Array3<f32>>,
+    /// What looked odd but is no error.
+    pub warnings: Vec<String>,
+}
+
+impl Scene {
+    /// Joins checked parts; measurements are simulated from the truth where `measurements` is `None`.
+    ///
+    /// # Errors
+    /// [`SceneError`] if sizes differ, values are not finite, or there is neither measurement nor truth.
+    pub fn new(
+        file: &str,
+        keys: &Keys,
+        mask: Array3<f32>,
+        measurements: Option<Array3<f32>>,
+        truth: Option<Array3<f32>>,
+    ) -> Result<Self, SceneError> {
+        let masks = MaskStack::new(mask).map_err(|source| SceneError::Mask {
+            file: file.into(),
+            key: keys.mask.clone(),
+            source,
+        })?;
+        let shape = masks.shape();
+        let mask_size = shape.image_dim();
+        for (key, array) in [(&keys.meas, &measurements), (&keys.orig, &truth)] {
+            if let Some(a) = array {
+                check_size(file, key, a, &keys.mask, mask_size)?;
+                check_finite(file, key, a)?;
+            }
+        }
+        let operator = MaskOperator::new(masks);
+        let mut warnings = Vec::new();
+        let measurements = match (measurements, &truth) {
+            (Some(m), _) => m,
+            (None, Some(x)) => simulate(file, &operator, x.view(), &mut warnings)?,
+            (None, None) => {
+                return Err(SceneError::MissingKey {
+                    file: file.into(),
+                    key: keys.meas.clone(),
+                    part: "measurements, or the truth to simulate them from",
+                    present: vec![keys.mask.clone()],
+                });
+            }
+        };
+        let mut scene = Self { operator, measurements, truth, warnings };
+        scene.look_for_wrong_scales();
+        Ok(scene)
+    }
+
+    /// B, frames a measurement sums.
+    pub fn frames(&self) -> usize {
+        self.operator.shape().frames
+    }
+
+    /// N, measurements.
+    pub fn len(&self) -> usize {
+        self.measurements.len_of(Axis(0))
+    }
+
+    /// Whether there is no measurement.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// y `[H, W]` of measurement `k`.
+    ///
+    /// # Panics
+    /// If `k` is not below [`Scene::len`].
+    pub fn measurement(&self, k: usize) -> ArrayView2<'_, f32> {
+        self.measurements.index_axis(Axis(0), k)
+    }
+
+    /// x `[B, H, W]` of measurement `k`, if the truth reaches that far.
+    pub fn truth_of(&self, k: usize) -> Option<ArrayView3<'_, f32>> {
+        let b = self.frames();
+        let truth = self.truth.as_ref()?;
+        (truth.len_of(Axis(0)) >= (k + 1) * b).then(|| truth.slice(s![k * b..(k + 1) * b, .., ..]))
+    }
+
+    /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers.
+    fn look_for_wrong_scales(&mut self) {
+        let brightest = self.operator.masks().sum().iter().copied().fold(0.0, f32::max);
+        let peak = self.measurements.iter().copied().fold(0.0, f32::max);
+        if peak > 2.0 * brightest {
+            self.warnings.push(format!(
+                "measurements reach {peak}, but the masks add up to {brightest} at most; is data.scale right?"
+            ));
+        }
+        let mismatch = (!self.is_empty()).then(|| self.truth_of(0)).flatten().map(|x| {
+            let expected = self.operator.forward(x);
+            let (mut off, mut all) = (0.0f64, 0.0f64);
+            for (&a, &b) in expected.iter().zip(self.measurement(0)) {
+                off += f64::from(a - b).powi(2);
+                all += f64::from(b).powi(2);
+            }
+            (off / all.max(f64::MIN_POSITIVE)).sqrt()
+        });
+        if let Some(mismatch) = mismatch.filter(|&m| m > 0.2) {
+            self.warnings.push(format!(
+                "measurement 0 differs by {:.0} % from the masked sum of the truth; do mask, measurement and truth belong together?",
+                100.0 * mismatch
+            ));
+        }
+    }
+}
+
+fn check_size(
+    file: &str,
+    key: &str,
+    array: &Array3<f32>,
+    mask: &str,
+    mask_size: (usize, usize),
+) -> Result<(), SceneError> {
+    let (_, h, w) = array.dim();
+    if (h, w) == mask_size {
+        return Ok(());
+    }
+    Err(SceneError::SizeMismatch { file: file.into(), key: key.into(), size: (h, w), mask: mask.into(), mask_size })
+}
+
+fn check_finite(file: &str, key: &str, array: &Array3<f32>) -> Result<(), SceneError> {
+    match array.indexed_iter().find(|(_, v)| !v.is_finite()) {
+        None => Ok(()),
+        Some(((frame, row, column), &value)) => {
+            Err(SceneError::NotFinite { file: file.into(), key: key.into(), value, frame, row, column })
+        }
+    }
+}
+
+/// y `[N, H, W]` of a video `[T, H, W]`, N = T / B rounded down.
+fn simulate(
+    file: &str,
+    operator: &MaskOperator,
+    truth: ArrayView3<'_, f32>,
+    warnings: &mut Vec<String>,
+) -> Result<Array3<f32>, SceneError> {
+    let b = operator.shape().frames;
+    let frames = truth.len_of(Axis(0));
+    let count = frames / b;
+    if count == 0 {
+        return Err(SceneError::TooFewFrames { file: file.into(), frames, needed: b });
+    }
+    if frames % b != 0 {
+        warnings
+            .push(format!("the last {} of {frames} frames fill no measurement of {b} and are left out", frames % b));
+    }
+    let (h, w) = operator.shape().image_dim();
+    let mut y = Array3::zeros((count, h, w));
+    for (k, y) in y.outer_iter_mut().enumerate() {
+        operator.forward_into(truth.slice(s![k * b..(k + 1) * b, .., ..]), y);
+    }
+    Ok(y)
+}
+
+/// Reads a scene: a .mat or .npz file, or a folder that holds each part as `<key>.npy`.
+///
+/// # Errors
+/// [`SceneError`] naming the file and the variable at fault.
+pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
+    let file = path.display().to_string();
+    let keys = &reading.keys;
+    let (mut found, format) = if path.is_dir() {
+        (read_folder(path, keys)?, Format::Npy)
+    } else {
+        let bytes = read_file(path)?;
+        read_container(&bytes, &keys.all())
+            .map_err(|e| FileError::new(path, e))?
+            .ok_or_else(|| SceneError::NotAScene { file: file.clone(), what: "a single array or video" })?
+    };
+    let missing = |key: &str, part| SceneError::MissingKey {
+        file: file.clone(),
+        key: key.into(),
+        part,
+        present: found.names.clone(),
+    };
+    if !found.arrays.contains_key(&keys.mask) {
+        return Err(missing(&keys.mask, "the masks"));
+    }
+    if !found.arrays.contains_key(&keys.meas) && !found.arrays.contains_key(&keys.orig) {
+        if found.arrays.contains_key(&keys.rgb) {
+            return Err(SceneError::ColorOnly { file, key: keys.rgb.clone() });
+        }
+        return Err(missing(&keys.meas, "measurements, or `orig` to simulate them from"));
+    }
+    let mut part = |key: &str, scale: Option<f32>| -> Result<Option<Array3<f32>>, SceneError> {
+        found.arrays.remove(key).map(|a| to_frames(&file, key, a, format, reading.axes, scale)).transpose()
+    };
+    let mask = part(&keys.mask, Some(1.0))?.map(normalise_mask);
+    let meas = part(&keys.meas, reading.scale)?;
+    let orig = part(&keys.orig, reading.scale)?;
+    let mask = mask.expect("presence was checked above");
+    Scene::new(&file, keys, mask, meas, orig)
+}
+
+/// Masks saved as black-and-white images run to 255.
+fn normalise_mask(mut mask: Array3<f32>) -> Array3<f32> {
+    if mask.iter().all(|&v| v == 0.0 || v == 255.0) {
+        mask /= 255.0;
+    }
+    mask
+}
+
+/// The named arrays of a .mat or .npz file; `None` for a file of another known format.
+fn read_container(bytes: &[u8], wanted: &[&str]) -> Result<Option<(NamedArrays, Format)>, ReadError> {
+    Ok(match Format::of(bytes)? {
+        Format::Mat => Some((mat::read(bytes, wanted)?, Format::Mat)),
+        Format::Npz => Some((npy::read_npz(bytes, wanted)?, Format::Npz)),
+        _ => None,
+    })
+}
+
+fn read_folder(path: &Path, keys: &Keys) -> Result<NamedArrays, SceneError> {
+    let mut found = NamedArrays::default();
+    for key in keys.all() {
+        let member = path.join(format!("{key}.npy"));
+        if member.is_file() {
+            let array = npy::read_npy(&read_file(&member)?).map_err(|e| FileError::new(&member, e))?;
+            found.names.push(key.to_owned());
+            found.arrays.insert(key.to_owned(), array);
+        }
+    }
+    if found.names.is_empty() {
+        frames::list(path)?;
+        return Err(SceneError::NotAScene { file: path.display().to_string(), what: "a folder of frames" });
+    }
+    Ok(found)
+}
+
+/// An array of 2 or 3 axes as `[T, H, W]`, divided by its scale.
+fn to_frames(
+    file: &str,
+    key: &str,
+    array: Array,
+    format: Format,
+    axes: Option<Axes>,
+    scale: Option<f32>,
+) -> Result<Array3<f32>, SceneError> {
+    let scale = scale.unwrap_or_else(|| default_scale(format, array.stored()));
+    let wrong = |shape: &[usize]| SceneError::Axes {
+        file: file.into(),
+        key: key.into(),
+        shape: shape.to_vec(),
+        expected: "two axes (one frame) or three, none of length 0",
+    };
+    let mut data = to_f32(array, scale);
+    if format == Format::Mat {
+        data = data.reversed_axes();
+    }
+    let shape = data.shape().to_vec();
+    if data.is_empty() {
+        return Err(wrong(&shape));
+    }
+    let default = if format == Format::Mat { Axes::Hwt } else { Axes::Thw };
+    let data = match (data.ndim(), axes.unwrap_or(default)) {
+        (2, _) => data.insert_axis(Axis(0)),
+        (3, Axes::Thw) => data,
+        (3, Axes::Hwt) => data.permuted_axes(IxDyn(&[2, 0, 1])),
+        _ => return Err(wrong(&shape)),
+    };
+    let data = data.into_dimensionality::<Ix3>().map_err(|_| wrong(&shape))?;
+    Ok(data.as_standard_layout().into_owned())
+}
+
+/// What white is stored as, unless the config says.
+fn default_scale(format: Format, stored: SampleType) -> f32 {
+    if format == Format::Mat || stored.is_integer() { 255.0 } else { 1.0 }
+}
+
+fn to_f32(array: Array, scale: f32) -> ArrayD<f32> {
+    let shape = IxDyn(array.shape());
+    let values = match array.samples() {
+        Samples::Bytes(v) => v.iter().map(|&b| f32::from(b) / scale).collect(),
+        Samples::Floats(v) => v.iter().map(|&x| x / scale).collect::<Vec<_>>(),
+    };
+    ArrayD::from_shape_vec(shape, values).expect("an Array's shape holds exactly its samples")
+}
+
+/// Reads any video as gray `[T, H, W]` in `[0, 1]`: GIF, Y4M, a folder of PNGs, or the `orig` (else `rgb`) of a file of
+/// arrays. Color becomes luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601, as MATLAB's `rgb2gray`).
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Array3<f32>, SceneError> {
+    let file = path.display().to_string();
+    if path.is_dir() {
+        return luma(&file, "frames", frames::read(path)?, reading);
+    }
+    let bytes = read_file(path)?;
+    let read_error = |e| FileError::new(path, e);
+    match Format::of(&bytes).map_err(read_error)? {
+        Format::Gif | Format::Y4m => luma(&file, "frames", read_video(&bytes).map_err(read_error)?, reading),
+        Format::Png => Err(SceneError::TooFewFrames { file, frames: 1, needed: 2 }),
+        Format::Npy => gray_array(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
+        Format::Mat | Format::Npz => {
+            let keys = &reading.keys;
+            let (mut found, format) =
+                read_container(&bytes, &[&keys.orig, &keys.rgb]).map_err(read_error)?.expect("this format is one");
+            let key = if found.arrays.contains_key(&keys.orig) { &keys.orig } else { &keys.rgb };
+            let Some(array) = found.arrays.remove(key) else {
+                return Err(SceneError::MissingKey {
+                    file,
+                    key: keys.orig.clone(),
+                    part: "the video",
+                    present: found.names,
+                });
+            };
+            gray_array(&file, key, array, format, reading)
+        }
+    }
+}
+
+fn gray_array(
+    file: &str,
+    key: &str,
+    array: Array,
+    format: Format,
+    reading: &Reading,
+) -> Result<Array3<f32>, SceneError> {
+    if array.shape().len() == 4 && format != Format::Mat {
+        return luma(file, key, array, reading);
+    }
+    to_frames(file, key, array, format, reading.axes, reading.scale)
+}
+
+/// A video `[T, C, H, W]` or `[T, H, W, C]`, C = 1 or 3, as luma.
+fn luma(file: &str, key: &str, array: Array, reading: &Reading) -> Result<Array3<f32>, SceneError> {
+    let wrong = |shape: &[usize]| SceneError::Axes {
+        file: file.into(),
+        key: key.into(),
+        shape: shape.to_vec(),
+        expected: "[T, H, W], [T, 1, H, W], [T, 3, H, W] or [T, H, W, 3], none of length 0",
+    };
+    let scale = reading.scale.unwrap_or_else(|| default_scale(Format::Npy, array.stored()));
+    let data = to_f32(array, scale);
+    let shape = data.shape().to_vec();
+    let channel_axis = match shape[..] {
+        [0, ..] | [_, 0, ..] | [_, _, 0, _] | [_, _, _, 0] => return Err(wrong(&shape)),
+        [_, 1 | 3, _, _] => 1,
+        [_, _, _, 1 | 3] => 3,
+        _ => return Err(wrong(&shape)),
+    };
+    let weights: &[f32] = if shape[channel_axis] == 1 { &[1.0] } else { &[0.299, 0.587, 0.114] };
+    let mut gray = ArrayD::zeros(data.index_axis(Axis(channel_axis), 0).raw_dim());
+    for (c, &weight) in weights.iter().enumerate() {
+        gray.scaled_add(weight, &data.index_axis(Axis(channel_axis), c));
+    }
+    gray.into_dimensionality::<Ix3>().map_err(|_| wrong(&shape))
+}
+
+/// Reads masks `[B, H, W]` alone, from a file of arrays (`mask`), a `.npy`, or a folder of PNGs.
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_mask(path: &Path, reading: &Reading) -> Result<MaskStack, SceneError> {
+    let file = path.display().to_string();
+    let keys = &reading.keys;
+    let masks = if path.is_dir() && !path.join(format!("{}.npy", keys.mask)).is_file() {
+        luma(&file, "frames", frames::read(path)?, &Reading::default())?
+    } else {
+        let member = if path.is_dir() { path.join(format!("{}.npy", keys.mask)) } else { path.to_owned() };
+        let bytes = read_file(&member)?;
+        let read_error = |e| FileError::new(path, e);
+        let (array, format) = match Format::of(&bytes).map_err(read_error)? {
+            Format::Npy => (npy::read_npy(&bytes).map_err(read_error)?, Format::Npy),
+            _ => {
+                let (mut found, format) = read_container(&bytes, &[&keys.mask])
+                    .map_err(read_error)?
+                    .ok_or_else(|| FileError::new(path, ReadError::UnknownFormat))?;
+                let array = found.arrays.remove(&keys.mask).ok_or_else(|| SceneError::MissingKey {
+                    file: file.clone(),
+                    key: keys.mask.clone(),
+                    part: "the masks",
+                    present: found.names,
+                })?;
+                (array, format)
+            }
+        };
+        to_frames(&file, &keys.mask, array, format, reading.axes, Some(1.0))?
+    };
+    MaskStack::new(normalise_mask(masks)).map_err(|source| SceneError::Mask { file, key: keys.mask.clone(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::mat::{Variable, write_v5};
+
+    /// Column-major `[H, W, T]` samples of a function of (t, row, column).
+    fn column_major((t, h, w): (usize, usize, usize), f: impl Fn(usize, usize, usize) -> f32) -> Vec<f32> {
+        let mut v = Vec::new();
+        for k in 0..t {
+            for x in 0..w {
+                for y in 0..h {
+                    v.push(f(k, y, x));
+                }
+            }
+        }
+        v
+    }
+
+    fn write_scene(dir: &Path, meas: Option<Vec<f32>>) -> std::path::PathBuf {
+        let mask = column_major((2, 3, 4), |t, y, x| ((t + y + x) % 2) as f32);
+        let orig = column_major((4, 3, 4), |t, y, x| (60 * t + 10 * y + x) as f32);
+        let mut variables = vec![
+            Variable { name: "mask", size: &[3, 4, 2], data: &mask },
+            Variable { name: "orig", size: &[3, 4, 4], data: &orig },
+        ];
+        if let Some(m) = &meas {
+            variables.push(Variable { name: "meas", size: &[3, 4, 2], data: m });
+        }
+        let path = dir.join("scene.mat");
+        let mut bytes = Vec::new();
+        write_v5(&mut bytes, &variables).unwrap();
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    #[test]
+    fn mat_axes_and_scale() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = read(&write_scene(dir.path(), None), &Reading::default()).unwrap();
+        assert_eq!((scene.len(), scene.frames()), (2, 2));
+        let truth = scene.truth_of(1).unwrap();
+        assert_eq!(truth[[1, 2, 3]], (180.0 + 23.0) / 255.0);
+        // Pixel (2, 3): mask 0 is open (0 + 2 + 3 odd), mask 1 closed.
+        assert_eq!(scene.measurement(0)[[2, 3]], 23.0 / 255.0);
+        assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
+    }
+
+    #[test]
+    fn a_measurement_of_another_scale_is_noticed() {
+        let dir = tempfile::tempdir().unwrap();
+        let meas = column_major((2, 3, 4), |_, _, _| 255.0 * 255.0);
+        let scene = read(&write_scene(dir.path(), Some(meas)), &Reading::default()).unwrap();
+        assert_eq!(scene.warnings.len(), 2, "{:?}", scene.warnings);
+    }
+
+    #[test]
+    fn nan_is_located() {
+        let dir = tempfile::tempdir().unwrap();
+        let meas = column_major((2, 3, 4), |t, y, x| if (t, y, x) == (1, 2, 0) { f32::NAN } else { 1.0 });
+        let error = read(&write_scene(dir.path(), Some(meas)), &Reading::default()).unwrap_err().to_string();
+        assert!(error.contains("`meas` is NaN at frame 1, row 2, column 0"), "{error}");
+    }
+}

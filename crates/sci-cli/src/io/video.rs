@@ -1,0 +1,248 @@
+//! Owns video files: animated GIF (read and write) and Y4M (read).
+
+use std::io::{BufRead, Cursor, Write};
+
+use image::{AnimationDecoder, ImageDecoder, Limits, codecs::gif::GifDecoder};
+use ndarray::ArrayView4;
+
+use super::ReadError;
+use super::frames::{push_planes, to_byte};
+use super::samples::{Array, Budget, SampleType, Samples};
+
+const GIF: &str = ".gif";
+const Y4M: &str = ".y4m";
+/// Longest side accepted, so that no product of sizes can overflow.
+const MAX_SIDE: usize = 1 << 16;
+
+/// Whether the bytes open like a GIF.
+pub fn is_gif(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"GIF8")
+}
+
+/// Whether the bytes open like a Y4M stream.
+pub fn is_y4m(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"YUV4MPEG2")
+}
+
+/// Reads an animated GIF as `[T, C, H, W]`, 0 to 255; C = 1 if every pixel of every frame is gray, else 3.
+///
+/// # Errors
+/// [`ReadError`] for broken bytes or more pixels than the file's budget.
+pub fn read_gif(bytes: &[u8]) -> Result<Array, ReadError> {
+    let broken = |e: image::ImageError| ReadError::Malformed { format: GIF, reason: e.to_string() };
+    let mut budget = Budget::for_file(bytes.len());
+    let mut decoder = GifDecoder::new(Cursor::new(bytes)).map_err(broken)?;
+    let (w, h) = decoder.dimensions();
+    let pixels = w as usize * h as usize;
+    // The decoder keeps one canvas, and hands out one frame at a time, both RGBA.
+    budget.claim(pixels, 8)?;
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(Budget::for_file(bytes.len()).left() as u64);
+    decoder.set_limits(limits).map_err(broken)?;
+    let mut planes = Vec::new();
+    let mut frames = 0;
+    for frame in decoder.into_frames() {
+        let rgba = frame.map_err(broken)?.into_buffer().into_raw();
+        budget.claim(pixels, 3)?;
+        push_planes(&mut planes, &rgba, 4);
+        frames += 1;
+    }
+    if frames == 0 {
+        return Err(ReadError::Malformed { format: GIF, reason: "no frames".into() });
+    }
+    drop_equal_channels(planes, frames, h as usize, w as usize)
+}
+
+/// Keeps one channel of a video `[T, 3, H, W]` whose channels are all equal.
+fn drop_equal_channels(planes: Vec<u8>, t: usize, h: usize, w: usize) -> Result<Array, ReadError> {
+    let n = h * w;
+    let gray = n > 0 && planes.chunks_exact(3 * n).all(|f| f[..n] == f[n..2 * n] && f[..n] == f[2 * n..]);
+    if gray {
+        let v: Vec<u8> = planes.chunks_exact(3 * n).flat_map(|f| f[..n].iter().copied()).collect();
+        Array::new(vec![t, 1, h, w], Samples::Bytes(v), SampleType::U8)
+    } else {
+        Array::new(vec![t, 3, h, w], Samples::Bytes(planes), SampleType::U8)
+    }
+}
+
+/// Reads a Y4M stream, 8 bits a sample, as `[T, C, H, W]`, 0 to 255: C = 1 for `mono`, else RGB.
+///
+/// YCbCr is taken as BT.601, limited range (16 to 235) unless the header says `XCOLORRANGE=FULL`; chroma of a
+/// subsampled stream is repeated.
+///
+/// # Errors
+/// [`ReadError`] for broken bytes, more than 8 bits a sample, or more pixels than the file's budget.
+pub fn read_y4m(bytes: &[u8]) -> Result<Array, ReadError> {
+    let bad = |reason: String| ReadError::Malformed { format: Y4M, reason };
+    let full_range = check_y4m_header(bytes)?;
+    let mut budget = Budget::for_file(bytes.len());
+    let limits = y4m::Limits { bytes: budget.left() };
+    let mut reader = Cursor::new(bytes);
+    let mut decoder = y4m::Decoder::new_with_limits(&mut reader, limits).map_err(|e| bad(e.to_string()))?;
+    if decoder.get_bytes_per_sample() != 1 {
+        return Err(bad(format!("{} bits a sample, only 8 are supported", decoder.get_bit_depth())));
+    }
+    let (w, h) = (decoder.get_width(), decoder.get_height());
+    let space = decoder.get_colorspace();
+    budget.claim(w * h, 3)?;
+    let channels = if matches!(space, y4m::Colorspace::Cmono) { 1 } else { 3 };
+    let mut planes = Vec::new();
+    let mut frames = 0;
+    loop {
+        match decoder.read_frame() {
+            Ok(frame) => {
+                budget.claim(w * h, channels)?;
+                let ycc = [frame.get_y_plane(), frame.get_u_plane(), frame.get_v_plane()];
+                push_ycc(&mut planes, ycc, space, (w, h), full_range);
+                frames += 1;
+            }
+            Err(y4m::Error::EOF) => break,
+            Err(e) => return Err(bad(format!("frame {frames}: {e}"))),
+        }
+    }
+    if frames == 0 {
+        return Err(bad("no frames".into()));
+    }
+    Array::new(vec![frames, channels, h, w], Samples::Bytes(planes), SampleType::U8)
+}
+
+/// Checks the sizes in the header line, which the decoder multiplies unchecked; says whether samples use all of 0 to 255.
+fn check_y4m_header(bytes: &[u8]) -> Result<bool, ReadError> {
+    let mut line = Vec::new();
+    (&bytes[..bytes.len().min(4096)]).read_until(b'\n', &mut line).map_err(ReadError::Io)?;
+    let line = String::from_utf8_lossy(&line);
+    for field in line.split_ascii_whitespace().skip(1) {
+        if let Some(side) = field.strip_prefix('W').or_else(|| field.strip_prefix('H')) {
+            if !side.parse::<usize>().is_ok_and(|n| (1..=MAX_SIDE).contains(&n)) {
+                return Err(ReadError::Malformed {
+                    format: Y4M,
+                    reason: format!("header field {field:?}: a side is 1 to {MAX_SIDE} pixels"),
+                });
+            }
+        }
+    }
+    Ok(line.contains("XCOLORRANGE=FULL"))
+}
+
+fn push_ycc(out: &mut Vec<u8>, [y, u, v]: [&[u8]; 3], space: y4m::Colorspace, (w, h): (usize, usize), full: bool) {
+    use y4m::Colorspace as C;
+    let (y_scale, y_zero, c_scale) = if full { (1.0, 0.0, 1.0) } else { (255.0 / 219.0, 16.0, 255.0 / 224.0) };
+    let luma = |i: usize| (f32::from(y[i]) - y_zero) * y_scale;
+    let byte = |x: f32| x.round().clamp(0.0, 255.0) as u8;
+    let (sx, sy) = match space {
+        C::Cmono | C::Cmono12 => {
+            out.extend((0..w * h).map(|i| byte(luma(i))));
+            return;
+        }
+        C::C444 | C::C444p10 | C::C444p12 => (1, 1),
+        C::C422 | C::C422p10 | C::C422p12 => (2, 1),
+        _ => (2, 2),
+    };
+    let chroma = |plane: &[u8], i: usize| {
+        let (row, col) = (i / w / sy, i % w / sx);
+        (f32::from(plane[row * w.div_ceil(sx) + col]) - 128.0) * c_scale
+    };
+    out.extend((0..w * h).map(|i| byte(luma(i) + 1.402 * chroma(v, i))));
+    out.extend((0..w * h).map(|i| byte(luma(i) - 0.344_136 * chroma(u, i) - 0.714_136 * chroma(v, i))));
+    out.extend((0..w * h).map(|i| byte(luma(i) + 1.772 * chroma(u, i))));
+}
+
+/// Writes a video `[T, C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as an endless animated GIF of `fps` frames a second.
+///
+/// Gray video keeps all 256 levels; color is reduced to 256 colors a frame.
+///
+/// # Errors
+/// The encoder's or the writer's error; a side above 65535 pixels.
+pub fn write_gif(w: impl Write, video: ArrayView4<'_, f32>, fps: u16) -> Result<(), gif::EncodingError> {
+    let (_, channels, height, width) = video.dim();
+    let side = |n: usize| {
+        u16::try_from(n)
+            .map_err(|_| std::io::Error::new(std::io::ErrorKind::InvalidInput, "a GIF side is at most 65535 pixels"))
+    };
+    let (height, width) = (side(height)?, side(width)?);
+    let ramp: Vec<u8> = (0..=255).flat_map(|g| [g; 3]).collect();
+    let palette: &[u8] = if channels == 1 { &ramp } else { &[] };
+    let mut encoder = gif::Encoder::new(w, width, height, palette)?;
+    encoder.set_repeat(gif::Repeat::Infinite)?;
+    for frame in video.outer_iter() {
+        let mut gif_frame = if channels == 1 {
+            let levels: Vec<u8> = frame.iter().map(|&x| to_byte(x)).collect();
+            gif::Frame { width, height, buffer: levels.into(), ..Default::default() }
+        } else {
+            let rgb: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&x| to_byte(x)).collect();
+            gif::Frame::from_rgb_speed(width, height, &rgb, 10)
+        };
+        gif_frame.delay = 100 / fps.max(1);
+        encoder.write_frame(&gif_frame)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array4;
+
+    #[test]
+    fn gray_gif_round_trip_is_exact() {
+        let video = Array4::from_shape_fn((3, 1, 5, 7), |(t, _, y, x)| ((t * 80 + y * 7 + x) as f32) / 255.0);
+        let mut bytes = Vec::new();
+        write_gif(&mut bytes, video.view(), 10).unwrap();
+        let read = read_gif(&bytes).unwrap();
+        assert_eq!(read.shape(), [3, 1, 5, 7]);
+        let expected: Vec<u8> = video.iter().map(|&x| to_byte(x)).collect();
+        assert_eq!(read.samples(), &Samples::Bytes(expected));
+    }
+
+    #[test]
+    fn color_gif_keeps_three_channels() {
+        let video = Array4::from_shape_fn((2, 3, 4, 4), |(_, c, _, _)| c as f32 / 2.0);
+        let mut bytes = Vec::new();
+        write_gif(&mut bytes, video.view(), 10).unwrap();
+        assert_eq!(read_gif(&bytes).unwrap().shape(), [2, 3, 4, 4]);
+    }
+
+    fn y4m_bytes(header: &str, frame: &[u8], frames: usize) -> Vec<u8> {
+        let mut bytes = format!("YUV4MPEG2 {header}\n").into_bytes();
+        for _ in 0..frames {
+            bytes.extend(b"FRAME\n");
+            bytes.extend(frame);
+        }
+        bytes
+    }
+
+    #[test]
+    fn y4m_ranges_and_subsampling() {
+        let mono = read_y4m(&y4m_bytes("W2 H1 F25:1 Cmono", &[16, 235], 2)).unwrap();
+        assert_eq!((mono.shape(), mono.samples()), (&[2, 1, 1, 2][..], &Samples::Bytes(vec![0, 255, 0, 255])));
+        let full = read_y4m(&y4m_bytes("W2 H1 F25:1 Cmono XCOLORRANGE=FULL", &[16, 235], 1)).unwrap();
+        assert_eq!(full.samples(), &Samples::Bytes(vec![16, 235]));
+        // A 3×3 picture has 2×2 chroma; gray chroma gives equal channels.
+        let mut frame = vec![126; 9];
+        frame.extend([128; 8]);
+        let color = read_y4m(&y4m_bytes("W3 H3 F25:1 C420jpeg", &frame, 1)).unwrap();
+        assert_eq!((color.shape(), color.samples()), (&[1, 3, 3, 3][..], &Samples::Bytes(vec![128; 27])));
+    }
+
+    #[test]
+    fn hostile_headers_give_errors() {
+        for header in ["W99999999999 H99999999999", "W65536 H65536 C444", "W0 H3", "W-1 H3", "W2 H1 C420p10", ""] {
+            assert!(read_y4m(&y4m_bytes(header, &[0; 30], 1)).is_err(), "{header}");
+        }
+        assert!(read_y4m(&y4m_bytes("W2 H2 Cmono", &[0; 3], 1)).is_err());
+        let huge = b"GIF89a\xff\xff\xff\xff\x80\x00\x00\0\0\0\xff\xff\xff,\0\0\0\0\xff\xff\xff\xff\x00\x02\x02D\x01\0;";
+        assert!(read_gif(huge).is_err());
+    }
+
+    #[test]
+    fn flipped_gif_bytes_never_panic() {
+        let mut bytes = Vec::new();
+        write_gif(&mut bytes, Array4::from_elem((2, 1, 4, 4), 0.5).view(), 10).unwrap();
+        for at in 0..bytes.len() {
+            let mut b = bytes.clone();
+            b[at] ^= 0xff;
+            let _ = read_gif(&b);
+            let _ = read_gif(&bytes[..at]);
+        }
+    }
+}

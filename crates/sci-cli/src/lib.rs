@@ -1,0 +1,12 @@
+//! The `sci` command as a library: readers, configs and commands, so that each can be tested and fuzzed on its own.
+//!
+//! `main.rs` only parses arguments and turns the result into an exit code. Errors are typed up to the commands; the
+//! chain is printed once, in `main`.
+
+pub mod commands;
+pub mod config;
+pub mod factory;
+pub mod io;
+pub mod progress;
+pub mod record;
+pub mod simulate;

@@ -1,0 +1,61 @@
+//! Owns what a user sees while a solve runs: a bar on a terminal, a line now and then elsewhere.
+
+use std::io::{IsTerminal, stderr};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// Time between lines where there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// The progress of one measurement.
+#[derive(Debug)]
+pub struct Progress {
+    measurement: usize,
+    iterations: usize,
+    bar: Option<ProgressBar>,
+    last_line: Instant,
+}
+
+impl Progress {
+    /// Progress of `iterations` on measurement number `measurement`; nothing is shown before [`Progress::start`].
+    pub fn new(measurement: usize, iterations: usize) -> Self {
+        Self { measurement, iterations, bar: None, last_line: Instant::now() }
+    }
+
+    /// Begins to show.
+    pub fn start(&mut self) {
+        self.last_line = Instant::now();
+        if !stderr().is_terminal() {
+            return;
+        }
+        let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len}  {msg}  {eta} left")
+            .expect("the template is fixed and has only known keys");
+        let bar = ProgressBar::new(self.iterations as u64).with_style(style);
+        bar.set_prefix(format!("measurement {:>2}", self.measurement));
+        self.bar = Some(bar);
+    }
+
+    /// Shows that `done` iterations are done.
+    pub fn step(&mut self, done: usize, psnr_db: Option<f64>) {
+        let quality = psnr_db.map_or(String::new(), |p| format!("{p:.2} dB"));
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position(done as u64);
+                bar.set_message(quality);
+            }
+            None if self.last_line.elapsed() >= LINE_EVERY => {
+                self.last_line = Instant::now();
+                eprintln!("measurement {:>2}   iteration {done} of {}   {quality}", self.measurement, self.iterations);
+            }
+            None => {}
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(self) {
+        if let Some(bar) = self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
