@@ -1,5 +1,6 @@
 //! What can go wrong in this crate.
 
+use crate::weights::Architecture;
 use candle_core::DType;
 use std::path::{Path, PathBuf};
 
@@ -131,6 +132,9 @@ pub enum Error {
         /// The loss there.
         loss: f32,
     },
+    /// A convolution kernel refused its arguments.
+    #[error(transparent)]
+    Kernel(#[from] crate::kernels::KernelError),
     /// A tensor operation failed.
     #[error(transparent)]
     Candle(#[from] candle_core::Error),
@@ -139,6 +143,10 @@ pub enum Error {
 impl Error {
     pub(crate) fn format(path: &Path, reason: impl Into<String>) -> Self {
         Self::Format { path: path.to_owned(), reason: reason.into() }
+    }
+
+    pub(crate) fn wrong_architecture(path: &Path, expected: &'static str, found: Architecture) -> Self {
+        Self::WrongArchitecture { path: path.to_owned(), expected, found: found.to_string() }
     }
 }
 

@@ -12,6 +12,7 @@
 //! Zhang, Zuo, Zhang, *FFDNet: toward a fast and flexible solution for CNN based image denoising*, 2018.
 //! Tassano, Delon, Veit, *An analysis and implementation of the FFDNet image denoising method*, IPOL 2019.
 
+use crate::infer::{Cache, channel_row, set_channel};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source};
 use crate::network::{Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
@@ -20,7 +21,7 @@ use crate::{Error, Result};
 use admm::{BoxError, DenoiseCx, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
-use ndarray::{ArrayView4, ArrayViewMut4, Axis};
+use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, s};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
@@ -128,6 +129,7 @@ impl std::fmt::Display for FfdnetSpec {
 pub struct Ffdnet {
     spec: FfdnetSpec,
     layers: Vec<Conv>,
+    cache: Cache,
 }
 
 impl Ffdnet {
@@ -158,6 +160,7 @@ impl Ffdnet {
                 source.finish(&path, &spec.to_string())?;
                 Ok(net)
             }
+            other => Err(Error::wrong_architecture(file.path(), "FFDNet", other)),
         }
     }
 
@@ -171,7 +174,40 @@ impl Ffdnet {
 
     fn build(spec: FfdnetSpec, source: &mut Source<'_>) -> Result<Self> {
         let layers = (0..spec.depth).map(|i| spec.layer(source, i)).collect::<Result<_>>()?;
-        Ok(Self { spec, layers })
+        Ok(Self { spec, layers, cache: Cache::default() })
+    }
+
+    /// One frame `[C, H, W]` without a tensor in the loop.
+    fn infer(&mut self, frame: ArrayView3<'_, f32>, sigma: f32, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+        let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
+        let (c, h, w) = frame.dim();
+        let (half_h, half_w) = (h.div_ceil(2), w.div_ceil(2));
+        let convs: Vec<&Conv> = self.layers.iter().collect();
+        let engine = self.cache.engine(&convs, &[])?;
+        engine.start(half_h, half_w);
+        let mut z = engine.image(4 * c + 1, half_h, half_w);
+        set_channel(&mut z, if residual { 0 } else { 4 * c }, |_, _| sigma);
+        for channel in 0..4 * c {
+            let (color, i, j) = (channel / 4, channel / 2 % 2, channel % 2);
+            let at = |i, n| Padding::Replicate.source(i, n);
+            set_channel(&mut z, channel + usize::from(residual), |y, x| {
+                frame[[color, at(2 * y + i, h), at(2 * x + j, w)]]
+            });
+        }
+        let z = engine.chain(0..self.spec.depth, z)?;
+        for (channel, y) in (0..4 * c).flat_map(|channel| (0..half_h).map(move |y| (channel, y))) {
+            let (color, i, j) = (channel / 4, channel / 2 % 2, channel % 2);
+            if 2 * y + i == h {
+                continue;
+            }
+            let columns = s![color, 2 * y + i, j..;2];
+            let noisy = frame.slice(columns);
+            for ((out, noisy), value) in out.slice_mut(columns).iter_mut().zip(noisy).zip(channel_row(&z, channel, y)) {
+                *out = if residual { noisy - value } else { value };
+            }
+        }
+        engine.recycle(z);
+        Ok(())
     }
 
     /// Its size and form.
@@ -208,6 +244,7 @@ impl Network for Ffdnet {
     }
 
     fn convs_mut(&mut self) -> Vec<&mut Conv> {
+        self.cache.forget();
         self.layers.iter_mut().collect()
     }
 
@@ -215,7 +252,7 @@ impl Network for Ffdnet {
         if let FfdnetLayout::Residual { batch_norm } = &mut self.spec.layout {
             *batch_norm = false;
             // The first and last layers have neither bias nor norm: folding leaves them as they are.
-            for layer in &mut self.layers {
+            for layer in self.convs_mut() {
                 layer.fold()?;
             }
         }
@@ -239,9 +276,13 @@ impl Denoiser for Ffdnet {
             return Ok(());
         }
         let device = self.device();
-        for (frame, out) in noisy.axis_chunks_iter(Axis(0), 1).zip(out.axis_chunks_iter_mut(Axis(0), 1)) {
-            let clean = self.forward(&to_tensor(frame, &device)?, &[cx.sigma])?;
-            copy_to(&clean, out).map_err(Error::from)?;
+        for (frame, out) in noisy.outer_iter().zip(out.outer_iter_mut()) {
+            if device.is_cpu() {
+                self.infer(frame, cx.sigma, out)?;
+            } else {
+                let clean = self.forward(&to_tensor(frame.insert_axis(Axis(0)), &device)?, &[cx.sigma])?;
+                copy_to(&clean, out.insert_axis(Axis(0))).map_err(Error::from)?;
+            }
         }
         Ok(())
     }

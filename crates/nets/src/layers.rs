@@ -78,6 +78,11 @@ impl Conv {
         self.weight.device()
     }
 
+    /// Whether the tensors are variables ([`Conv::make_trainable`]), which change behind the network's back.
+    pub(crate) fn is_variable(&self) -> bool {
+        self.weight.is_variable()
+    }
+
     /// Weight and bias with the batch norm folded in: `w γ/√(var+ε)`, `β − mean γ/√(var+ε)`; differentiable, so that
     /// training the affine part costs no pass over the activations.
     pub(crate) fn folded(&self) -> candle_core::Result<(Tensor, Option<Tensor>)> {

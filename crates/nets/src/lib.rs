@@ -15,16 +15,23 @@
 //! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
 //! ```
 
+mod ddnet;
 mod error;
+mod fastdvdnet;
 mod ffdnet;
+mod infer;
 pub mod kernels;
 mod layers;
 mod network;
+mod video;
 pub mod weights;
 
+pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};
+pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};
 pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
 pub use network::Network;
+pub use video::Ends;
 pub use weights::WeightFile;
 
 /// A result of this crate.

@@ -1,9 +1,10 @@
 //! The networks against outputs of public PyTorch implementations, with the published weights.
 
 use admm::{DenoiseCx, Denoiser};
+use candle_core::{Device, Tensor};
 use ndarray::{Array0, Array4, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
-use nets::{Ffdnet, Network, WeightFile};
+use nets::{Ends, Fastdvdnet, Ffdnet, Network, WeightFile};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -97,8 +98,25 @@ fn published_files_are_recognised() {
         ("weights/ffdnet_gray.pth", "FFDNet (gray, 64 channels, 15 layers)"),
         ("weights/ffdnet_color.pth", "FFDNet (color, 96 channels, 12 layers)"),
         ("weights/ffdnet_gray_ipol.pth", "FFDNet (gray, 64 channels, 15 layers, batch norm)"),
+        ("weights/fastdvdnet_half_color.pth", "FastDVDnet (color, 16/32/64 channels, batch norm)"),
     ] {
         let Some(path) = shared(name) else { return };
         assert_eq!(WeightFile::read(&path).unwrap().architecture().unwrap().to_string(), what);
     }
+}
+
+#[test]
+fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
+    let weights = shared("weights/fastdvdnet_half_color.pth");
+    let (Some(golden), Some(weights)) = (shared("golden/fastdvdnet_half_color.npz"), weights) else { return };
+    let mut net = Fastdvdnet::load(&weights, Ends::Circular).unwrap();
+    let mut golden = Golden::open(&golden);
+    let (noisy, sigma, expected) = (golden.video("input"), golden.number("sigma"), golden.video("output"));
+    assert_close(denoise(&mut net, &noisy, sigma).view(), expected.view(), 1e-4);
+    let tensor = |a: &Array4<f32>| Tensor::from_slice(a.as_slice().unwrap(), a.dim(), &Device::Cpu).unwrap();
+    let live = net.forward(&tensor(&noisy), &[sigma]).unwrap();
+    let live = Array4::from_shape_vec(noisy.dim(), live.flatten_all().unwrap().to_vec1().unwrap()).unwrap();
+    assert_close(live.view(), expected.view(), 1e-4);
+    net.fold_batch_norm().unwrap();
+    assert_close(denoise(&mut net, &noisy, sigma).view(), expected.view(), 1e-4);
 }

@@ -5,7 +5,7 @@
 mod bundled;
 mod pth;
 
-use crate::{Error, FfdnetSpec, Result};
+use crate::{Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Network, Result};
 use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,12 +18,18 @@ pub use bundled::bundled_names;
 pub enum Architecture {
     /// FFDNet, gray or color.
     Ffdnet(FfdnetSpec),
+    /// FastDVDnet, gray or color.
+    Fastdvdnet(FastdvdnetSpec),
+    /// DDNet.
+    Ddnet(DdnetSpec),
 }
 
 impl std::fmt::Display for Architecture {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Ffdnet(spec) => spec.fmt(f),
+            Self::Fastdvdnet(spec) => spec.fmt(f),
+            Self::Ddnet(spec) => spec.fmt(f),
         }
     }
 }
@@ -108,10 +114,14 @@ impl WeightFile {
     /// # Errors
     /// [`Error::UnknownArchitecture`].
     pub fn architecture(&self) -> Result<Architecture> {
-        FfdnetSpec::recognise(self).map(Architecture::Ffdnet).ok_or_else(|| Error::UnknownArchitecture {
-            path: self.path.clone(),
-            found: self.tensors.keys().cloned().collect(),
-        })
+        FastdvdnetSpec::recognise(self)
+            .map(Architecture::Fastdvdnet)
+            .or_else(|| DdnetSpec::recognise(self).map(Architecture::Ddnet))
+            .or_else(|| FfdnetSpec::recognise(self).map(Architecture::Ffdnet))
+            .ok_or_else(|| Error::UnknownArchitecture {
+                path: self.path.clone(),
+                found: self.tensors.keys().cloned().collect(),
+            })
     }
 
     /// Name, shape and stored type of every tensor.
@@ -141,6 +151,34 @@ impl WeightFile {
     pub(crate) fn shape(&self, name: &str) -> Option<&[usize]> {
         self.tensors.get(name).map(Tensor::dims)
     }
+}
+
+/// The network of a weight file, whichever it is; video networks with circular ends.
+///
+/// # Errors
+/// When the file is of no known network, or its tensors do not fit together.
+pub fn network(file: WeightFile) -> Result<Box<dyn Network>> {
+    Ok(match file.architecture()? {
+        Architecture::Ffdnet(_) => Box::new(Ffdnet::from_weights(file)?),
+        Architecture::Fastdvdnet(_) => Box::new(Fastdvdnet::from_weights(file, Ends::Circular)?),
+        Architecture::Ddnet(_) => Box::new(Ddnet::from_weights(file, Ends::Circular)?),
+    })
+}
+
+/// Rewrites a `.pth` or `.safetensors` file as `.safetensors`, on request with batch norm folded into the convolutions.
+/// Writing `.pth` is not offered: it would take a pickle writer, and PyTorch reads `.safetensors`.
+///
+/// # Errors
+/// When the input cannot be read as the weights of a known network, or the output cannot be written.
+pub fn convert(input: &Path, output: &Path, fold_batch_norm: bool, storage: Storage) -> Result<()> {
+    if output.extension().is_none_or(|e| e != "safetensors") {
+        return Err(Error::format(output, "weights are written as .safetensors only: give the file that extension"));
+    }
+    let mut net = network(WeightFile::read(input)?)?;
+    if fold_batch_norm {
+        net.fold_batch_norm()?;
+    }
+    write_safetensors(output, &net.state(), storage)
 }
 
 /// How [`write_safetensors`] stores numbers.
