@@ -38,6 +38,8 @@ impl<D: Denoiser> Admm<D> {
 pub struct AdmmState {
     x: Array3<f32>,
     theta: Array3<f32>,
+    /// θ of the iteration before.
+    previous: Array3<f32>,
     b: Array3<f32>,
 }
 
@@ -49,15 +51,21 @@ impl<D: Denoiser> Solver for Admm<D> {
     }
 
     fn init(&mut self, _: &Problem<'_>, start: Array3<f32>) -> AdmmState {
-        AdmmState { x: Array3::zeros(start.dim()), b: Array3::zeros(start.dim()), theta: start }
+        let zeros = Array3::zeros(start.dim());
+        AdmmState { x: zeros.clone(), b: zeros.clone(), previous: zeros, theta: start }
     }
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut AdmmState) -> Result<(), BoxError> {
-        let AdmmState { x, theta, b } = state;
-        Zip::from(&mut *x).and(&*theta).and(&*b).par_for_each(|x, &theta, &b| *x = theta + b);
-        problem.operator().data_step(DataStep { y: problem.y(), damping: self.gamma, momentum: None }, x.view_mut());
+        let AdmmState { x, theta, previous, b } = state;
+        std::mem::swap(previous, theta);
+        // θ is overwritten at the end of the step; until then its place holds p = θ + b.
+        let p = theta;
+        Zip::from(&mut *p).and(&*previous).and(&*b).par_for_each(|p, &theta, &b| *p = theta + b);
+        let step = DataStep { y: problem.y(), damping: self.gamma, momentum: None };
+        problem.operator().data_step(step, p.view(), x.view_mut());
         // x is only needed as x − b from here on: θ is denoised from it, and b ← b − (x − θ) = θ − (x − b).
         Zip::from(&mut *x).and(&*b).par_for_each(|x, &b| *x -= b);
+        let theta = p;
         self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), theta.view_mut().insert_axis(Axis(1)))?;
         Zip::from(b).and(&*theta).and(&*x).par_for_each(|b, &theta, &x| *b = theta - x);
         Ok(())
@@ -65,5 +73,9 @@ impl<D: Denoiser> Solver for Admm<D> {
 
     fn estimate<'s>(&self, state: &'s AdmmState) -> ArrayView3<'s, f32> {
         state.theta.view()
+    }
+
+    fn previous<'s>(&self, state: &'s AdmmState) -> ArrayView3<'s, f32> {
+        state.previous.view()
     }
 }

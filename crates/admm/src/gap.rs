@@ -55,6 +55,8 @@ pub struct GapState {
     x: Array3<f32>,
     /// The denoised v `[T, H, W]`.
     v: Array3<f32>,
+    /// v of the iteration before.
+    previous: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
     y1: Option<Array2<f32>>,
 }
@@ -71,19 +73,24 @@ impl<D: Denoiser> Solver for Gap<D> {
             MomentumStart::Zero => Array2::zeros(problem.y().dim()),
             MomentumStart::Measurement => problem.y().to_owned(),
         });
-        GapState { x: Array3::zeros(start.dim()), v: start, y1 }
+        let zeros = Array3::zeros(start.dim());
+        GapState { x: zeros.clone(), previous: zeros, v: start, y1 }
     }
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<(), BoxError> {
-        let GapState { x, v, y1 } = state;
-        // The denoised v becomes the x that is projected; the old x is where the next v is written.
-        std::mem::swap(x, v);
+        let GapState { x, v, previous, y1 } = state;
+        std::mem::swap(previous, v);
         let momentum = y1.as_mut().map(|y1| y1.view_mut());
-        problem.operator().data_step(DataStep { y: problem.y(), damping: 0.0, momentum }, x.view_mut());
+        let step = DataStep { y: problem.y(), damping: 0.0, momentum };
+        problem.operator().data_step(step, previous.view(), x.view_mut());
         self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), v.view_mut().insert_axis(Axis(1)))
     }
 
     fn estimate<'s>(&self, state: &'s GapState) -> ArrayView3<'s, f32> {
         state.v.view()
+    }
+
+    fn previous<'s>(&self, state: &'s GapState) -> ArrayView3<'s, f32> {
+        state.previous.view()
     }
 }

@@ -98,8 +98,7 @@ impl Start<'_> {
                 let mut projected = x.clone();
                 for iteration in 0..iterations {
                     let step = DataStep { y: problem.y, damping: 0.0, momentum: None };
-                    projected.assign(&x);
-                    problem.operator.data_step(step, projected.view_mut());
+                    problem.operator.data_step(step, x.view(), projected.view_mut());
                     let cx = DenoiseCx { sigma: 0.0, iteration, stage: 0 };
                     tv.denoise(&cx, projected.view().insert_axis(Axis(1)), x.view_mut().insert_axis(Axis(1)))
                         .map_err(|source| SolveError::Denoiser { name: tv.name().into(), iteration, source })?;

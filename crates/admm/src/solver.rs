@@ -1,8 +1,8 @@
 //! The one loop that drives every solver.
 
 use crate::{BoxError, DenoiseCx, IterInfo, Observer, Plan, Problem, Start};
-use ndarray::parallel::prelude::*;
-use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut3, Axis, Zip};
+use ndarray::{Array3, Array4, ArrayView3, ArrayView4};
+use sci_forward::Progress;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
@@ -85,8 +85,16 @@ pub trait Solver {
     /// The estimate where the sensor sees it: gray or mosaic video `[T, H, W]`.
     fn estimate<'s>(&self, state: &'s Self::State) -> ArrayView3<'s, f32>;
 
+    /// The estimate of the iteration before (of the start, after the first), `[T, H, W]`.
+    fn previous<'s>(&self, state: &'s Self::State) -> ArrayView3<'s, f32>;
+
     /// The RGB estimate `[T, 3, H, W]` of a color solver.
     fn rgb<'s>(&self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
+        None
+    }
+
+    /// The RGB estimate of the iteration before (nothing, after the first).
+    fn previous_rgb<'s>(&self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
         None
     }
 }
@@ -123,7 +131,8 @@ pub fn run<S: Solver>(
 ) -> Result<Outcome<S::State>, SolveError> {
     let mut clock = Stopwatch::start();
     let start = start.video(problem)?;
-    let mut best = LastGood::new(problem, start.clone());
+    let mut relative_residual =
+        relative(problem.operator().progress(problem.y(), start.view(), start.view()), problem).0;
     let mut state = solver.init(problem, start);
     clock.pause();
     observer.begin(plan).map_err(|source| SolveError::Observer { iteration: 0, source })?;
@@ -133,32 +142,28 @@ pub fn run<S: Solver>(
     'stages: for (stage, &crate::Stage { sigma, iterations: count }) in plan.stages.iter().enumerate() {
         for _ in 0..count {
             clock.resume();
-            let cx = DenoiseCx { sigma, iteration: iterations, stage };
-            solver.step(problem, &cx, &mut state).map_err(|source| SolveError::Denoiser {
-                name: solver.denoiser_name().to_owned(),
-                iteration: cx.iteration,
-                source,
+            let iteration = iterations;
+            let cx = DenoiseCx { sigma, iteration, stage };
+            solver.step(problem, &cx, &mut state).map_err(|source| {
+                let name = solver.denoiser_name().to_owned();
+                SolveError::Denoiser { name, iteration, source }
             })?;
             iterations += 1;
-            let advance = best.advance(problem, solver.estimate(&state), solver.rgb(&state), plan.stop.diverged_above);
+            let estimate = solver.estimate(&state);
+            let progress = problem.operator().progress(problem.y(), estimate, solver.previous(&state));
+            let rgb = solver.rgb(&state);
             clock.pause();
-            let Some(relative_change) = advance else {
+
+            let (residual, relative_change) = relative(progress, problem);
+            let good = residual <= plan.stop.diverged_above && relative_change.is_finite();
+            if !good || rgb.is_some_and(|rgb| !rgb.iter().all(|v| v.is_finite())) {
                 stop = StopReason::Diverged;
                 break 'stages;
-            };
-            let info = IterInfo {
-                iteration: cx.iteration,
-                stage,
-                sigma,
-                estimate: best.estimate.view(),
-                rgb: best.rgb.as_ref().map(|rgb| rgb.view()),
-                relative_residual: best.relative_residual,
-                relative_change,
-                seconds: clock.elapsed().as_secs_f64(),
-            };
-            let flow =
-                observer.iteration(&info).map_err(|source| SolveError::Observer { iteration: cx.iteration, source })?;
-            stop = match flow {
+            }
+            relative_residual = residual;
+            let seconds = clock.elapsed().as_secs_f64();
+            let info = IterInfo { iteration, stage, sigma, estimate, rgb, relative_residual, relative_change, seconds };
+            stop = match observer.iteration(&info).map_err(|source| SolveError::Observer { iteration, source })? {
                 ControlFlow::Break(()) => StopReason::Observer,
                 _ if relative_change <= plan.stop.relative_change => StopReason::Converged,
                 _ if plan.stop.time.is_some_and(|limit| clock.elapsed() >= limit) => StopReason::TimeUp,
@@ -167,105 +172,21 @@ pub fn run<S: Solver>(
             break 'stages;
         }
     }
+    let (estimate, rgb) = match stop {
+        StopReason::Diverged => (solver.previous(&state), solver.previous_rgb(&state)),
+        _ => (solver.estimate(&state), solver.rgb(&state)),
+    };
+    let (estimate, rgb) = (estimate.to_owned(), rgb.map(|rgb| rgb.to_owned()));
     let seconds = clock.elapsed().as_secs_f64();
-    let LastGood { estimate, rgb, relative_residual, .. } = best;
     Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual })
 }
 
-/// The newest estimate that is finite and fits the measurement, kept apart from the solver's state.
-struct LastGood {
-    estimate: Array3<f32>,
-    rgb: Option<Array4<f32>>,
-    relative_residual: f64,
-    hx: Array2<f32>,
-}
-
-impl LastGood {
-    fn new(problem: &Problem<'_>, estimate: Array3<f32>) -> Self {
-        let hx = Array2::zeros(problem.y().dim());
-        let mut last = Self { estimate, rgb: None, relative_residual: 0.0, hx };
-        last.relative_residual = last.residual_of(problem, None);
-        last
-    }
-
-    /// `‖y − H x‖ / ‖y‖` of `candidate`, or of the kept estimate.
-    fn residual_of(&mut self, problem: &Problem<'_>, candidate: Option<ArrayView3<'_, f32>>) -> f64 {
-        let x = candidate.unwrap_or(self.estimate.view());
-        problem.operator().forward_into(x, self.hx.view_mut());
-        let sum = Zip::from(&self.hx).and(problem.y()).fold(0.0, |s, &a, &b| s + f64::from(a - b).powi(2));
-        sum.sqrt() / problem.scale()
-    }
-
-    /// Takes a candidate and returns the relative change, or keeps the old estimate and returns nothing if it diverged.
-    fn advance(
-        &mut self,
-        problem: &Problem<'_>,
-        candidate: ArrayView3<'_, f32>,
-        rgb: Option<ArrayView4<'_, f32>>,
-        diverged_above: f64,
-    ) -> Option<f64> {
-        let residual = self.residual_of(problem, Some(candidate));
-        // A NaN anywhere in a measured pixel makes the residual NaN; the norm below catches the unmeasured ones.
-        if !(residual <= diverged_above) {
-            return None;
-        }
-        let norms = norms(candidate, self.estimate.view());
-        if !norms.1.is_finite() || rgb.is_some_and(|rgb| !rgb.iter().all(|v| v.is_finite())) {
-            return None;
-        }
-        copy_frames(candidate, self.estimate.view_mut());
-        match (&mut self.rgb, rgb) {
-            (Some(kept), Some(rgb)) => kept.assign(&rgb),
-            (kept, rgb) => *kept = rgb.map(|rgb| rgb.to_owned()),
-        }
-        self.relative_residual = residual;
-        let (change, norm) = norms;
-        Some(if norm > 0.0 { (change / norm).sqrt() } else { change.sqrt() })
-    }
-}
-
-/// `(‖new − old‖², ‖new‖²)`, each frame summed on its own and the frames in order, so that threads do not change the result.
-fn norms(new: ArrayView3<'_, f32>, old: ArrayView3<'_, f32>) -> (f64, f64) {
-    let frames: Vec<(f64, f64)> = new
-        .axis_iter(Axis(0))
-        .into_par_iter()
-        .zip(old.axis_iter(Axis(0)))
-        .map(|(new, old)| {
-            new.outer_iter().zip(old.outer_iter()).fold((0.0, 0.0), |(change, norm), (new, old)| {
-                let (c, n) = match (new.as_slice(), old.as_slice()) {
-                    (Some(new), Some(old)) => row_norms(new, old),
-                    _ => row_norms(&new.to_vec(), &old.to_vec()),
-                };
-                (change + f64::from(c), norm + f64::from(n))
-            })
-        })
-        .collect();
-    frames.iter().fold((0.0, 0.0), |(a, b), (c, n)| (a + c, b + n))
-}
-
-/// The sums of one row, over 16 lanes in `f32`.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn row_norms(new: &[f32], old: &[f32]) -> (f32, f32) {
-    let (mut change, mut norm) = ([0f32; 16], [0f32; 16]);
-    let (new_chunks, new_rest) = new.as_chunks::<16>();
-    let (old_chunks, old_rest) = old.as_chunks::<16>();
-    for (new, old) in new_chunks.iter().zip(old_chunks) {
-        for lane in 0..16 {
-            let d = new[lane] - old[lane];
-            change[lane] += d * d;
-            norm[lane] += new[lane] * new[lane];
-        }
-    }
-    for (lane, (new, old)) in new_rest.iter().zip(old_rest).enumerate() {
-        let d = new - old;
-        change[lane] += d * d;
-        norm[lane] += new * new;
-    }
-    (change.iter().sum(), norm.iter().sum())
-}
-
-fn copy_frames(from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) {
-    to.axis_iter_mut(Axis(0)).into_par_iter().zip(from.axis_iter(Axis(0))).for_each(|(mut to, from)| to.assign(&from));
+/// `‖y − H x‖ / ‖y‖` and `‖x − previous‖ / ‖x‖`; a NaN or an infinity in `x` makes one of them not finite.
+fn relative(progress: Progress, problem: &Problem<'_>) -> (f64, f64) {
+    let change = progress.change.sqrt();
+    let change = if progress.norm > 0.0 { change / progress.norm.sqrt() } else { change };
+    // An infinite norm would hide behind a quotient of 0.
+    (progress.residual.sqrt() / problem.scale(), if progress.norm.is_finite() { change } else { f64::NAN })
 }
 
 /// A clock that stands still while observers work.

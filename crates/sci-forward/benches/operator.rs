@@ -8,7 +8,7 @@ fn operator(c: &mut Criterion) {
     for size in [256, 1024] {
         let shape = VideoShape { frames: 8, height: size, width: size };
         let operator = MaskOperator::new(MaskStack::random(shape, 0.5, 0).expect("a valid shape and density"));
-        let mut x = uniform(shape.dim(), 1);
+        let x = uniform(shape.dim(), 1);
         let mut y = operator.forward(x.view());
         let mut y1 = y.clone();
         let measured = y.clone();
@@ -24,14 +24,23 @@ fn operator(c: &mut Criterion) {
         group.bench_function("adjoint", |b| b.iter(|| operator.adjoint_into(measured.view(), copy.view_mut())));
         group.throughput(Throughput::Bytes(3 * video + 2 * image));
         group.bench_function("projection", |b| {
-            b.iter(|| operator.data_step(DataStep { y: measured.view(), damping: 0.0, momentum: None }, x.view_mut()))
+            b.iter(|| {
+                operator.data_step(
+                    DataStep { y: measured.view(), damping: 0.0, momentum: None },
+                    x.view(),
+                    copy.view_mut(),
+                )
+            })
         });
+        let previous = x.clone();
+        group.bench_function("progress", |b| b.iter(|| operator.progress(measured.view(), x.view(), previous.view())));
         group.throughput(Throughput::Bytes(3 * video + 4 * image));
         group.bench_function("accelerated projection", |b| {
             b.iter(|| {
                 operator.data_step(
                     DataStep { y: measured.view(), damping: 0.0, momentum: Some(y1.view_mut()) },
-                    x.view_mut(),
+                    x.view(),
+                    copy.view_mut(),
                 )
             })
         });

@@ -34,7 +34,7 @@ pub mod testing;
 pub use bayer::{CfaPattern, Demosaicer};
 pub use mask::{MaskError, MaskStack};
 pub use noise::{Noise, NoiseError};
-pub use operator::{DataStep, MaskOperator, SensingOperator};
+pub use operator::{DataStep, MaskOperator, Progress, SensingOperator};
 
 /// The error type at the seams where a plug-in (a denoiser, a demosaicer, an observer) reports to code that cannot know its errors.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync + 'static>;

@@ -7,12 +7,16 @@
 use crate::{MaskStack, VideoShape};
 use multiversion::multiversion;
 use ndarray::parallel::prelude::*;
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis, Zip};
+use ndarray::{
+    Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, ArrayViewMut3, Axis, Zip,
+};
 
 /// Rows of one parallel task.
 const BAND: usize = 16;
-/// Columns of a row whose sums are held on the stack, 4 KB of `f32`.
-const CHUNK: usize = 1024;
+/// Columns that are worked on at a time, 1 KB of `f32` a frame.
+const CHUNK: usize = 256;
+/// Lanes of the explicit sums, so that they vectorise in a fixed order.
+const LANES: usize = 16;
 /// A pixel with `Σ C_t²` up to this counts as one that no mask opens: the square root is far below any sensor's noise,
 /// and 1 / gram stays finite in `f32`.
 pub(crate) const CLOSED: f32 = 1e-30;
@@ -37,14 +41,15 @@ pub trait SensingOperator: Send + Sync {
     /// `diag(H Hᵀ)` `[H, W]`, all ≥ 0. It is 0 where no mask is open; such a pixel is never divided by.
     fn gram_diag(&self) -> ArrayView2<'_, f32>;
 
-    /// Moves `x` `[T, H, W]` towards the measurement in closed form, see [`DataStep`]. Returns `‖y − H x‖²` of the `x` it was given.
+    /// Moves `from` `[T, H, W]` towards the measurement in closed form and writes the result to `to`, see [`DataStep`].
+    /// Returns `‖y − H from‖²`.
     ///
     /// # Panics
     /// If a size differs from [`SensingOperator::shape`].
-    fn data_step(&self, step: DataStep<'_>, mut x: ArrayViewMut3<'_, f32>) -> f64 {
-        let mut hx = self.forward(x.view());
-        let residual = squared_distance(step.y, hx.view());
+    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> f64 {
         let DataStep { y, damping, momentum } = step;
+        let mut hx = self.forward(from);
+        let residual = Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + f64::from(y - hx).powi(2));
         match momentum {
             Some(mut y1) => Zip::from(&mut hx).and(y).and(&mut y1).for_each(|hx, &y, y1| {
                 *y1 += y - *hx;
@@ -53,10 +58,23 @@ pub trait SensingOperator: Send + Sync {
             None => hx.zip_mut_with(&y, |hx, &y| *hx = y - *hx),
         }
         hx.zip_mut_with(&self.gram_diag(), |c, &gram| *c = if gram > CLOSED { *c / (gram + damping) } else { 0.0 });
-        let mut correction = Array3::zeros(x.dim());
-        self.adjoint_into(hx.view(), correction.view_mut());
-        x += &correction;
+        self.adjoint_into(hx.view(), to.view_mut());
+        to += &from;
         residual
+    }
+
+    /// How far an iterate `x` `[T, H, W]` is from the measurement and from the iterate before it.
+    ///
+    /// # Panics
+    /// If a size differs from [`SensingOperator::shape`].
+    fn progress(&self, y: ArrayView2<'_, f32>, x: ArrayView3<'_, f32>, previous: ArrayView3<'_, f32>) -> Progress {
+        let hx = self.forward(x);
+        let square = |v: f32| f64::from(v).powi(2);
+        Progress {
+            residual: Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + square(y - hx)),
+            change: Zip::from(x).and(previous).fold(0.0, |sum, &x, &p| sum + square(x - p)),
+            norm: x.fold(0.0, |sum, &x| sum + square(x)),
+        }
     }
 
     /// [`SensingOperator::forward_into`] into a new array.
@@ -74,15 +92,26 @@ pub trait SensingOperator: Send + Sync {
     }
 }
 
-/// A closed-form data step on `x`, the heart of GAP and ADMM:
+/// Squared norms that tell how a solver gets on.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Progress {
+    /// `‖y − H x‖²`.
+    pub residual: f64,
+    /// `‖x − previous‖²`.
+    pub change: f64,
+    /// `‖x‖²`. Not finite if a value of `x` is not.
+    pub norm: f64,
+}
+
+/// A closed-form data step, the heart of GAP and ADMM:
 ///
 /// ```text
-/// x ← x + Hᵀ (t − H x) / (diag(H Hᵀ) + damping)
+/// to = from + Hᵀ (t − H from) / (diag(H Hᵀ) + damping)
 /// ```
 ///
-/// with the target `t = y`, or with momentum (accelerated GAP) `y1 ← y1 + (y − H x)`, `t = y1`.
-/// `damping = 0` projects onto `{x : H x = t}`; `damping = γ > 0` solves `argmin ‖y − H x′‖² + γ‖x′ − x‖²`
-/// (paper, Eq. `qv_k+1`). Pixels with `diag(H Hᵀ) = 0` keep their `x`.
+/// with the target `t = y`, or with momentum (accelerated GAP) `y1 ← y1 + (y − H from)`, `t = y1`.
+/// `damping = 0` projects onto `{x : H x = t}`; `damping = γ > 0` solves `argmin_x ‖y − H x‖² + γ‖x − from‖²`
+/// (paper, Eq. `qv_k+1`). Pixels with `diag(H Hᵀ) = 0` stay as they are.
 #[derive(Debug)]
 pub struct DataStep<'a> {
     /// The measurement `[H, W]`.
@@ -102,8 +131,9 @@ pub struct DataStep<'a> {
 /// let shape = VideoShape { frames: 4, height: 8, width: 8 };
 /// let h = MaskOperator::new(MaskStack::random(shape, 0.9, 1)?);
 /// let y = h.forward(Array3::from_elem(shape.dim(), 0.7).view());
-/// let mut x = Array3::zeros(shape.dim());
-/// h.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, x.view_mut());
+/// let start = Array3::zeros(shape.dim());
+/// let mut x = start.clone();
+/// h.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, start.view(), x.view_mut());
 /// assert!((h.forward(x.view()) - y).iter().all(|d| d.abs() < 1e-5)); // projected: H x = y
 /// # Ok::<(), sci_forward::MaskError>(())
 /// ```
@@ -146,7 +176,11 @@ impl SensingOperator for MaskOperator {
             .into_par_iter()
             .zip(x.axis_chunks_iter(Axis(1), BAND))
             .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
-            .for_each(|((y, x), c)| forward_band(c, x, y));
+            .for_each(|((mut y, x), c)| {
+                for (row, y) in y.outer_iter_mut().enumerate() {
+                    forward_row(rows_at(c, row), rows_at(x, row), y);
+                }
+            });
     }
 
     fn adjoint_into(&self, y: ArrayView2<'_, f32>, mut x: ArrayViewMut3<'_, f32>) {
@@ -162,100 +196,214 @@ impl SensingOperator for MaskOperator {
         self.gram.view()
     }
 
-    fn data_step(&self, step: DataStep<'_>, mut x: ArrayViewMut3<'_, f32>) -> f64 {
-        self.check(x.dim(), step.y.dim());
+    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> f64 {
         let DataStep { y, damping, momentum } = step;
-        let masks = self.masks.view();
-        let bands = x
+        self.check(from.dim(), y.dim());
+        self.check(to.dim(), y.dim());
+        // Without momentum every band is handed an empty piece of an empty array.
+        let mut none = Array2::zeros((y.nrows(), 0));
+        let mut y1 = momentum.unwrap_or(none.view_mut());
+        assert!(y1.is_empty() || y1.dim() == y.dim(), "the momentum must have the measurement's size");
+        let residuals: Vec<f64> = to
             .axis_chunks_iter_mut(Axis(1), BAND)
             .into_par_iter()
-            .zip(masks.axis_chunks_iter(Axis(1), BAND).into_par_iter())
-            .zip(self.gram.axis_chunks_iter(Axis(0), BAND).into_par_iter())
-            .zip(y.axis_chunks_iter(Axis(0), BAND).into_par_iter());
-        let residuals: Vec<f64> = match momentum {
-            Some(mut y1) => {
-                assert_eq!(y1.dim(), y.dim(), "the momentum must have the measurement's size");
-                bands
-                    .zip(y1.axis_chunks_iter_mut(Axis(0), BAND))
-                    .map(|((((x, c), gram), y), y1)| data_step_band(x, c, gram, y, Some(y1), damping))
-                    .collect()
-            }
-            None => bands.map(|(((x, c), gram), y)| data_step_band(x, c, gram, y, None, damping)).collect(),
-        };
+            .zip(from.axis_chunks_iter(Axis(1), BAND))
+            .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
+            .zip(self.gram.axis_chunks_iter(Axis(0), BAND))
+            .zip(y.axis_chunks_iter(Axis(0), BAND))
+            .zip(y1.axis_chunks_iter_mut(Axis(0), BAND))
+            .map(|(((((mut to, from), c), gram), y), mut y1)| {
+                let mut local = Local::new(from.dim().0);
+                let mut residual = 0.0;
+                for row in 0..y.nrows() {
+                    let target = Target { gram: gram.row(row), y: y.row(row), damping };
+                    let to = to.index_axis_mut(Axis(1), row);
+                    residual +=
+                        data_step_row(rows_at(c, row), rows_at(from, row), to, target, y1.row_mut(row), &mut local);
+                }
+                residual
+            })
+            .collect();
         residuals.iter().sum()
+    }
+
+    fn progress(&self, y: ArrayView2<'_, f32>, x: ArrayView3<'_, f32>, previous: ArrayView3<'_, f32>) -> Progress {
+        self.check(x.dim(), y.dim());
+        self.check(previous.dim(), y.dim());
+        let bands: Vec<Progress> = y
+            .axis_chunks_iter(Axis(0), BAND)
+            .into_par_iter()
+            .zip(x.axis_chunks_iter(Axis(1), BAND))
+            .zip(previous.axis_chunks_iter(Axis(1), BAND))
+            .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
+            .map(|(((y, x), previous), c)| {
+                let mut hx = Array2::zeros((1, y.ncols()));
+                (0..y.nrows()).fold(Progress::default(), |sum, row| {
+                    let (x, previous) = (rows_at(x, row), rows_at(previous, row));
+                    sum.plus(progress_row(rows_at(c, row), x, previous, y.row(row), hx.row_mut(0)))
+                })
+            })
+            .collect();
+        bands.into_iter().fold(Progress::default(), Progress::plus)
     }
 }
 
-/// `Σ (a − b)²` in `f64`, row by row.
-pub(crate) fn squared_distance(a: ArrayView2<'_, f32>, b: ArrayView2<'_, f32>) -> f64 {
-    Zip::from(a).and(b).fold(0.0, |sum, &a, &b| sum + f64::from(a - b).powi(2))
+impl Progress {
+    fn plus(self, o: Self) -> Self {
+        Self { residual: self.residual + o.residual, change: self.change + o.change, norm: self.norm + o.norm }
+    }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn forward_band(c: ArrayView3<'_, f32>, x: ArrayView3<'_, f32>, mut y: ArrayViewMut2<'_, f32>) {
+/// Row `row` of every frame, `[T, W]`.
+fn rows_at(video: ArrayView3<'_, f32>, row: usize) -> ArrayView2<'_, f32> {
+    video.index_axis_move(Axis(1), row)
+}
+
+/// The measurement's side of a row of a data step.
+struct Target<'a> {
+    gram: ArrayView1<'a, f32>,
+    y: ArrayView1<'a, f32>,
+    damping: f32,
+}
+
+/// A chunk of a row of the video and of the masks, frame after frame.
+///
+/// The frames of a video whose size is a power of two lie on the same cache sets; read a second time from their own
+/// place, they would have evicted each other.
+struct Local {
+    video: Vec<f32>,
+    masks: Vec<f32>,
+}
+
+impl Local {
+    fn new(frames: usize) -> Self {
+        Self { video: vec![0.0; frames * CHUNK], masks: vec![0.0; frames * CHUNK] }
+    }
+}
+
+/// `y = Σ_t c_t x_t` of one row; `c` and `x` are `[T, W]`.
+fn forward_row(c: ArrayView2<'_, f32>, x: ArrayView2<'_, f32>, mut y: ArrayViewMut1<'_, f32>) {
     y.fill(0.0);
     for (c, x) in c.outer_iter().zip(x.outer_iter()) {
-        for ((mut y, c), x) in y.outer_iter_mut().zip(c.outer_iter()).zip(x.outer_iter()) {
-            match (y.as_slice_mut(), c.as_slice(), x.as_slice()) {
-                (Some(y), Some(c), Some(x)) => y.iter_mut().zip(c.iter().zip(x)).for_each(|(y, (c, x))| *y += c * x),
-                _ => Zip::from(&mut y).and(c).and(x).for_each(|y, &c, &x| *y += c * x),
-            }
+        match (y.as_slice_mut(), c.as_slice(), x.as_slice()) {
+            (Some(y), Some(c), Some(x)) => add_product(y, c, x),
+            _ => Zip::from(&mut y).and(c).and(x).for_each(|y, &c, &x| *y += c * x),
         }
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn data_step_band(
-    mut x: ArrayViewMut3<'_, f32>,
-    c: ArrayView3<'_, f32>,
-    gram: ArrayView2<'_, f32>,
-    y: ArrayView2<'_, f32>,
-    mut y1: Option<ArrayViewMut2<'_, f32>>,
-    damping: f32,
+fn add_product(sum: &mut [f32], a: &[f32], b: &[f32]) {
+    for ((sum, a), b) in sum.iter_mut().zip(a).zip(b) {
+        *sum += a * b;
+    }
+}
+
+/// [`SensingOperator::data_step`] of one row; `c`, `from` and `to` are `[T, W]`.
+fn data_step_row(
+    c: ArrayView2<'_, f32>,
+    from: ArrayView2<'_, f32>,
+    mut to: ArrayViewMut2<'_, f32>,
+    target: Target<'_>,
+    mut y1: ArrayViewMut1<'_, f32>,
+    local: &mut Local,
 ) -> f64 {
-    let (frames, rows, width) = x.dim();
-    let mut sums = [0f32; CHUNK];
-    let mut residual = 0f64;
-    for row in 0..rows {
-        for start in (0..width).step_by(CHUNK) {
-            let columns = ndarray::s![row, start..(start + CHUNK).min(width)];
-            let sums = &mut sums[..CHUNK.min(width - start)];
-            sums.fill(0.0);
-            for t in 0..frames {
-                let (c, x) = (c.index_axis(Axis(0), t), x.index_axis(Axis(0), t));
-                let (c, x) = (c.slice(columns), x.slice(columns));
-                match (c.as_slice(), x.as_slice()) {
-                    (Some(c), Some(x)) => sums.iter_mut().zip(c.iter().zip(x)).for_each(|(s, (c, x))| *s += c * x),
-                    _ => sums.iter_mut().zip(c.iter().zip(x)).for_each(|(s, (c, x))| *s += c * x),
+    let (frames, width) = from.dim();
+    let mut coefficients = [0f32; CHUNK];
+    let mut residual = 0.0;
+    for start in (0..width).step_by(CHUNK) {
+        let count = CHUNK.min(width - start);
+        let columns = ndarray::s![start..start + count];
+        let coefficients = &mut coefficients[..count];
+        coefficients.fill(0.0);
+        for t in 0..frames {
+            let (x, c) = (from.row(t).slice_move(columns), c.row(t).slice_move(columns));
+            let (video, masks) = (&mut local.video[t * count..][..count], &mut local.masks[t * count..][..count]);
+            copy(x, video);
+            copy(c, masks);
+            add_product(coefficients, masks, video);
+        }
+        for (i, v) in coefficients.iter_mut().enumerate() {
+            let x = start + i;
+            let error = target.y[x] - *v;
+            residual += f64::from(error).powi(2);
+            let towards = match y1.get_mut(x) {
+                Some(y1) => {
+                    *y1 += error;
+                    *y1 - *v
                 }
-            }
-            let (gram, y) = (gram.slice(columns), y.slice(columns));
-            let mut y1 = y1.as_mut().map(|y1| y1.slice_mut(columns));
-            for (i, sum) in sums.iter_mut().enumerate() {
-                let error = y[i] - *sum;
-                residual += f64::from(error).powi(2);
-                let target = match &mut y1 {
-                    Some(y1) => {
-                        y1[i] += error;
-                        y1[i] - *sum
-                    }
-                    None => error,
-                };
-                *sum = if gram[i] > CLOSED { target / (gram[i] + damping) } else { 0.0 };
-            }
-            for t in 0..frames {
-                let c = c.index_axis(Axis(0), t);
-                let c = c.slice(columns);
-                let mut x = x.index_axis_mut(Axis(0), t);
-                let mut x = x.slice_mut(columns);
-                match (x.as_slice_mut(), c.as_slice()) {
-                    (Some(x), Some(c)) => x.iter_mut().zip(c.iter().zip(&*sums)).for_each(|(x, (c, s))| *x += c * s),
-                    _ => x.iter_mut().zip(c.iter().zip(&*sums)).for_each(|(x, (c, s))| *x += c * s),
-                }
+                None => error,
+            };
+            *v = if target.gram[x] > CLOSED { towards / (target.gram[x] + target.damping) } else { 0.0 };
+        }
+        for t in 0..frames {
+            let (video, masks) = (&local.video[t * count..][..count], &local.masks[t * count..][..count]);
+            let mut to = to.row_mut(t).slice_move(columns);
+            match to.as_slice_mut() {
+                Some(to) => write_sum(to, video, masks, coefficients),
+                None => to
+                    .iter_mut()
+                    .zip(video.iter().zip(masks.iter().zip(&*coefficients)))
+                    .for_each(|(to, (x, (c, v)))| *to = x + c * v),
             }
         }
     }
     residual
+}
+
+fn copy(from: ArrayView1<'_, f32>, to: &mut [f32]) {
+    match from.as_slice() {
+        Some(from) => to.copy_from_slice(from),
+        None => to.iter_mut().zip(from).for_each(|(to, from)| *to = *from),
+    }
+}
+
+/// `to = x + c v`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn write_sum(to: &mut [f32], x: &[f32], c: &[f32], v: &[f32]) {
+    for (((to, x), c), v) in to.iter_mut().zip(x).zip(c).zip(v) {
+        *to = x + c * v;
+    }
+}
+
+/// [`SensingOperator::progress`] of one row; `c`, `x` and `previous` are `[T, W]`, and `hx` is scratch.
+fn progress_row(
+    c: ArrayView2<'_, f32>,
+    x: ArrayView2<'_, f32>,
+    previous: ArrayView2<'_, f32>,
+    y: ArrayView1<'_, f32>,
+    mut hx: ArrayViewMut1<'_, f32>,
+) -> Progress {
+    forward_row(c, x, hx.view_mut());
+    let residual = Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + f64::from(y - hx).powi(2));
+    let (change, norm) = x.outer_iter().zip(previous.outer_iter()).fold((0.0, 0.0), |(change, norm), (x, previous)| {
+        let (c, n) = match (x.as_slice(), previous.as_slice()) {
+            (Some(x), Some(previous)) => change_and_norm(x, previous),
+            _ => change_and_norm(&x.to_vec(), &previous.to_vec()),
+        };
+        (change + f64::from(c), norm + f64::from(n))
+    });
+    Progress { residual, change, norm }
+}
+
+/// `(‖x − previous‖², ‖x‖²)`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn change_and_norm(x: &[f32], previous: &[f32]) -> (f32, f32) {
+    let (mut change, mut norm) = ([0f32; LANES], [0f32; LANES]);
+    let (chunks, rest) = x.as_chunks::<LANES>();
+    let (previous_chunks, previous_rest) = previous.as_chunks::<LANES>();
+    for (x, previous) in chunks.iter().zip(previous_chunks) {
+        for lane in 0..LANES {
+            let d = x[lane] - previous[lane];
+            change[lane] += d * d;
+            norm[lane] += x[lane] * x[lane];
+        }
+    }
+    for (lane, (x, previous)) in rest.iter().zip(previous_rest).enumerate() {
+        change[lane] += (x - previous) * (x - previous);
+        norm[lane] += x * x;
+    }
+    (change.iter().sum(), norm.iter().sum())
 }
 
 #[cfg(test)]
@@ -318,15 +466,20 @@ mod tests {
 
                 for accelerated in [false, true] {
                     let run = |operator: &dyn SensingOperator| {
-                        let (mut x, mut y1) = (x.clone(), y.mapv(|v| v * 0.5));
+                        let (mut to, mut y1) = (x.mapv(|_| f32::NAN), y.mapv(|v| v * 0.5));
                         let momentum = accelerated.then(|| y1.view_mut());
-                        let residual = operator.data_step(DataStep { y: y.view(), damping, momentum }, x.view_mut());
-                        (x, y1, residual)
+                        let residual = operator.data_step(DataStep { y: y.view(), damping, momentum }, x.view(), to.view_mut());
+                        (to, y1, residual)
                     };
                     let ((x, y1, residual), (nx, ny1, nresidual)) = (run(&fast), run(&naive));
                     prop_assert_eq!(x, nx);
                     prop_assert_eq!(y1, ny1);
                     prop_assert!((residual - nresidual).abs() <= 1e-9 * nresidual);
+                }
+                let previous = uniform(shape.dim(), seed + 2);
+                let (fast, naive) = (fast.progress(y.view(), x.view(), previous.view()), naive.progress(y.view(), x.view(), previous.view()));
+                for (a, b) in [(fast.residual, naive.residual), (fast.change, naive.change), (fast.norm, naive.norm)] {
+                    prop_assert!((a - b).abs() <= 1e-5 * b, "{a} {b}");
                 }
             }
         }
@@ -335,10 +488,10 @@ mod tests {
         fn a_projected_video_has_the_measurement(shape in shapes(), seed in any::<u64>()) {
             for masks in mask_families(shape, seed) {
                 let operator = MaskOperator::new(masks);
-                let mut x = uniform(shape.dim(), seed);
-                let before = x.clone();
+                let before = uniform(shape.dim(), seed);
+                let mut x = before.clone();
                 let y = operator.forward(uniform(shape.dim(), seed + 1).view());
-                operator.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, x.view_mut());
+                operator.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, before.view(), x.view_mut());
                 let hx = operator.forward(x.view());
                 for ((i, j), &gram) in operator.gram_diag().indexed_iter() {
                     if gram > CLOSED {
@@ -362,11 +515,10 @@ mod tests {
         let y = gaussian(shape.image_dim(), 2);
         let mut a = wide.clone();
         let mut b = packed.clone();
-        operator.data_step(
-            DataStep { y: y.view(), damping: 0.1, momentum: None },
-            a.slice_mut(ndarray::s![.., ..;2, 1..;2]),
-        );
-        operator.data_step(DataStep { y: y.view(), damping: 0.1, momentum: None }, b.view_mut());
+        let step = || DataStep { y: y.view(), damping: 0.1, momentum: None };
+        operator.data_step(step(), strided, a.slice_mut(ndarray::s![.., ..;2, 1..;2]));
+        operator.data_step(step(), packed.view(), b.view_mut());
+        assert_eq!(operator.progress(y.view(), strided, strided), operator.progress(y.view(), packed.view(), strided));
         assert_eq!(a.slice(ndarray::s![.., ..;2, 1..;2]), b);
     }
 
@@ -376,11 +528,15 @@ mod tests {
         let operator = MaskOperator::new(MaskStack::random(shape, 0.5, 0).unwrap());
         let y = gaussian(shape.image_dim(), 2);
         let run = |threads| {
-            let mut x = uniform(shape.dim(), 1);
+            let from = uniform(shape.dim(), 1);
+            let mut x = from.clone();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let residual = pool
-                .install(|| operator.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, x.view_mut()));
-            (x, residual.to_bits())
+            pool.install(|| {
+                let step = DataStep { y: y.view(), damping: 0.0, momentum: None };
+                let residual = operator.data_step(step, from.view(), x.view_mut());
+                let progress = operator.progress(y.view(), x.view(), from.view());
+                (x, [residual, progress.residual, progress.change, progress.norm].map(f64::to_bits))
+            })
         };
         assert_eq!(run(1), run(2));
         assert_eq!(run(1), run(3));
