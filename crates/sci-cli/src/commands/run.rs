@@ -41,7 +41,7 @@ impl Args {
             return Err(UsageError(format!("--out {}: it is a file, expected a folder", out.display())).into());
         }
         catch_interrupts()?;
-        let scene = read_scene(&experiment).context("data")?;
+        let scene = read_scene(&experiment).context("data.path")?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
         let chosen = choose(&experiment, &scene)?;
         let mut factory = Factory::new(&experiment)?;
@@ -241,7 +241,7 @@ fn finish(experiment: &Experiment, scene: &Scene, solutions: &[Solution], out: &
         outln!("mean             PSNR {p:6.2} dB   SSIM {s:.4}   {:.2} s", record.mean.seconds);
     }
     write(experiment, scene, solutions, &record, out)?;
-    outln!("wrote {}", out.join("report.html").display());
+    outln!("wrote {}", out.display());
     let diverged = record.measurements.iter().filter(|m| m.stop == crate::record::Stop::Diverged).count();
     anyhow::ensure!(
         diverged == 0,

@@ -2,7 +2,7 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use toml::Spanned;
+use toml::Value as Toml;
 
 use super::file::*;
 use super::source::{ConfigError, Source};
@@ -230,49 +230,65 @@ impl<'s> Checker<'s> {
         Ok(Checked { name, seed, data, solver, start, denoisers, stages, relative_change, seconds, output })
     }
 
-    fn name(&self, name: Option<Spanned<String>>) -> Result<Option<String>, ConfigError> {
-        let Some(name) = name else { return Ok(None) };
-        let legal = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-        let part_ok = |p: &str| !p.is_empty() && !p.starts_with('.') && p.chars().all(legal);
-        if !name.get_ref().split('/').all(part_ok) {
-            return Err(self.value_error(
-                "name",
-                &name.span(),
-                "letters, digits, '.', '_' and '-', in parts joined by '/'",
-            ));
-        }
-        Ok(Some(name.into_inner()))
+    fn name(&self, name: Value) -> Result<Option<String>, ConfigError> {
+        let legal = "letters, digits, '.', '_' and '-', in parts joined by '/'";
+        let part_ok = |p: &str| {
+            !p.is_empty() && !p.starts_with('.') && p.chars().all(|c| c.is_ascii_alphanumeric() || "._-".contains(c))
+        };
+        self.text("name", &name, legal, |n| n.split('/').all(part_ok))
     }
 
     fn data(&self, mut section: Section<'s>, seed: u64) -> Result<Data, ConfigError> {
         let span = section.span.clone();
         let kind = section.take_kind(&["scene", "simulate"], Some("scene"))?;
-        if kind.get_ref() == "scene" {
-            let k: SceneKeys = section.read(&["kind"])?;
-            return Ok(Data {
-                path: self.path("data.path", k.path, &span)?,
-                measurements: self.measurements(k.measurements)?,
-                reading: self.reading(k.keys, k.axes, k.scale)?,
-                simulate: None,
-            });
-        }
-        let mask = section.take("mask")?;
-        let k: SimulateKeys = section.read(&["kind", "mask"])?;
-        let mask = mask.ok_or_else(|| {
-            self.source.error(&span, "`data.mask` is missing: data.kind = \"simulate\" needs [data.mask]")
-        })?;
-        let mask = self.mask(mask, seed)?;
-        let noise = k.noise.unwrap_or(NoiseKeys { sigma: None, photons: None, seed: None });
+        let names = section.take("keys")?;
+        let mut also = vec!["kind", "keys"];
+        let simulate = if kind.get_ref() == "simulate" {
+            also.extend(["mask", "noise"]);
+            let (mask, noise) = (section.take("mask")?, section.take("noise")?);
+            let problem = "`data.mask` is missing: data.kind = \"simulate\" needs a table [data.mask]";
+            let mask = mask.ok_or_else(|| self.source.error(&span, problem))?;
+            Some(self.simulate(mask, noise, seed)?)
+        } else {
+            None
+        };
+        let k: DataKeys = section.read(&also)?;
         Ok(Data {
             path: self.path("data.path", k.path, &span)?,
             measurements: self.measurements(k.measurements)?,
-            reading: self.reading(k.keys, k.axes, k.scale)?,
-            simulate: Some(Simulate {
-                mask,
-                sigma: self.number("data.noise.sigma", &noise.sigma, 0.0..=255.0)?.unwrap_or(0.0) as f32,
-                photons: self.number("data.noise.photons", &noise.photons, 1e-3..=1e9)?,
-                seed: self.whole("data.noise.seed", &noise.seed, SEEDS)?.map_or(seed, |s| s as u64),
-            }),
+            reading: Reading {
+                keys: self.part_names(names)?,
+                axes: self.choice("data.axes", &k.axes, &[("hwt", Axes::Hwt), ("thw", Axes::Thw)])?,
+                scale: self.number("data.scale", &k.scale, 1e-6..=1e6)?.map(|s| s as f32),
+            },
+            simulate,
+        })
+    }
+
+    fn part_names(&self, section: Option<Section<'s>>) -> Result<Keys, ConfigError> {
+        let names: PartNames = section.map(|s| s.read(&[])).transpose()?.unwrap_or_default();
+        let default = Keys::default();
+        let name = |part: &str, value: &Value, default: String| {
+            let name =
+                self.text(&format!("data.keys.{part}"), value, "the name of a variable, in quotes", |n| !n.is_empty())?;
+            Ok(name.unwrap_or(default))
+        };
+        Ok(Keys {
+            mask: name("mask", &names.mask, default.mask)?,
+            meas: name("meas", &names.meas, default.meas)?,
+            orig: name("orig", &names.orig, default.orig)?,
+            rgb: name("rgb", &names.rgb, default.rgb)?,
+        })
+    }
+
+    fn simulate(&self, mask: Section<'s>, noise: Option<Section<'s>>, seed: u64) -> Result<Simulate, ConfigError> {
+        let mask = self.mask(mask, seed)?;
+        let noise: NoiseKeys = noise.map(|n| n.read(&[])).transpose()?.unwrap_or_default();
+        Ok(Simulate {
+            mask,
+            sigma: self.number("data.noise.sigma", &noise.sigma, 0.0..=255.0)?.unwrap_or(0.0) as f32,
+            photons: self.number("data.noise.photons", &noise.photons, 1e-3..=1e9)?,
+            seed: self.whole("data.noise.seed", &noise.seed, SEEDS)?.map_or(seed, |s| s as u64),
         })
     }
 
@@ -292,39 +308,18 @@ impl<'s> Checker<'s> {
         Ok(if kind.get_ref() == "random" { Mask::Random(random) } else { Mask::Shifting(random) })
     }
 
-    fn measurements(&self, list: Option<Spanned<Vec<Spanned<i64>>>>) -> Result<Option<Vec<usize>>, ConfigError> {
+    fn measurements(&self, list: Value) -> Result<Option<Vec<usize>>, ConfigError> {
         let Some(list) = list else { return Ok(None) };
-        let legal = "a list of at least one measurement, each named once, counted from 0";
-        let mut indices = Vec::new();
-        for index in list.get_ref() {
-            match usize::try_from(*index.get_ref()) {
-                Ok(i) if !indices.contains(&i) => indices.push(i),
-                _ => return Err(self.value_error("data.measurements", &index.span(), legal)),
+        let index = |v: &Toml| v.as_integer().and_then(|i| usize::try_from(i).ok());
+        let indices = list.get_ref().as_array().and_then(|l| l.iter().map(index).collect::<Option<Vec<usize>>>());
+        let distinct = |l: &Vec<usize>| !l.is_empty() && l.iter().enumerate().all(|(i, k)| !l[..i].contains(k));
+        match indices.filter(distinct) {
+            Some(indices) => Ok(Some(indices)),
+            None => {
+                let legal = "a list of whole numbers from 0, at least one, none twice, for example [0, 2]";
+                Err(self.value_error("data.measurements", &list.span(), legal))
             }
         }
-        if indices.is_empty() {
-            return Err(self.value_error("data.measurements", &list.span(), legal));
-        }
-        Ok(Some(indices))
-    }
-
-    fn reading(
-        &self,
-        keys: Option<PartNames>,
-        axes: Option<Spanned<String>>,
-        scale: Option<Spanned<f64>>,
-    ) -> Result<Reading, ConfigError> {
-        let (names, default) = (keys.unwrap_or_default(), Keys::default());
-        Ok(Reading {
-            keys: Keys {
-                mask: names.mask.unwrap_or(default.mask),
-                meas: names.meas.unwrap_or(default.meas),
-                orig: names.orig.unwrap_or(default.orig),
-                rgb: names.rgb.unwrap_or(default.rgb),
-            },
-            axes: self.choice("data.axes", &axes, &[("hwt", Axes::Hwt), ("thw", Axes::Thw)])?,
-            scale: self.number("data.scale", &scale, 1e-6..=1e6)?.map(|s| s as f32),
-        })
     }
 
     fn solver(&self, mut section: Section<'s>) -> Result<(Solver, Start), ConfigError> {
@@ -333,7 +328,7 @@ impl<'s> Checker<'s> {
             "gap" => {
                 let k: GapKeys = section.read(&["kind"])?;
                 let start = self.start(k.start, k.start_iterations, k.start_weight)?;
-                let accelerate = k.accelerate.as_ref().is_none_or(|a| *a.get_ref());
+                let accelerate = self.flag("solver.accelerate", &k.accelerate)?.unwrap_or(true);
                 let legal = [("zero", Momentum::Zero), ("measurement", Momentum::Measurement)];
                 let momentum = self.choice("solver.momentum", &k.momentum, &legal)?;
                 if let (false, Some(m)) = (accelerate, &k.momentum) {
@@ -354,12 +349,7 @@ impl<'s> Checker<'s> {
         }
     }
 
-    fn start(
-        &self,
-        start: Option<Spanned<String>>,
-        iterations: Option<Spanned<i64>>,
-        weight: Option<Spanned<f64>>,
-    ) -> Result<Start, ConfigError> {
+    fn start(&self, start: Value, iterations: Value, weight: Value) -> Result<Start, ConfigError> {
         let count = self.whole("solver.start_iterations", &iterations, 1..=MAX_ITERATIONS)?.unwrap_or(20) as usize;
         let tv_weight = self.number("solver.start_weight", &weight, 1e-6..=100.0)?.unwrap_or(0.1) as f32;
         let tv = Start::Tv { iterations: count, weight: tv_weight };
@@ -441,7 +431,7 @@ impl<'s> Checker<'s> {
                 Ok(Denoiser::Tv {
                     weight: self.number(&format!("{key}.weight"), &k.weight, 1e-6..=100.0)?.unwrap_or(0.3) as f32,
                     inner: self.whole(&format!("{key}.inner"), &k.inner, 1..=1000)?.unwrap_or(5) as usize,
-                    warm_dual: k.warm_dual.is_some_and(|w| *w.get_ref()),
+                    warm_dual: self.flag(&format!("{key}.warm_dual"), &k.warm_dual)?.unwrap_or(false),
                 })
             }
             "ffdnet" => {
@@ -455,8 +445,9 @@ impl<'s> Checker<'s> {
     fn switched_off(&self, key: &str, section: Option<Section<'s>>) -> Result<(), ConfigError> {
         let Some(section) = section else { return Ok(()) };
         let k: SwitchKeys = section.read(&[])?;
-        match k.enabled {
-            Some(on) if *on.get_ref() => Err(self.not_yet(&format!("{key}.enabled"), &on.span(), "false")),
+        let enabled = format!("{key}.enabled");
+        match (self.flag(&enabled, &k.enabled)?, &k.enabled) {
+            (Some(true), Some(value)) => Err(self.not_yet(&enabled, &value.span(), "false")),
             _ => Ok(()),
         }
     }
@@ -474,67 +465,66 @@ impl<'s> Checker<'s> {
         let formats = [("npy", OutputFormat::Npy), ("npz", OutputFormat::Npz), ("mat", OutputFormat::Mat)];
         Ok(Output {
             format: self.choice("output.format", &k.format, &formats)?.unwrap_or(OutputFormat::Npy),
-            frames: k.frames.is_none_or(|f| *f.get_ref()),
-            preview: k.preview.is_none_or(|p| *p.get_ref()),
+            frames: self.flag("output.frames", &k.frames)?.unwrap_or(true),
+            preview: self.flag("output.preview", &k.preview)?.unwrap_or(true),
             fps: self.whole("output.fps", &k.fps, 1..=50)?.unwrap_or(10) as u16,
         })
     }
 
-    fn path(&self, key: &str, path: Option<Spanned<String>>, table: &Range<usize>) -> Result<PathSetting, ConfigError> {
-        match path {
-            Some(path) if !path.get_ref().is_empty() => {
-                Ok(PathSetting { key: key.into(), span: path.span(), text: path.into_inner() })
-            }
-            Some(path) => Err(self.value_error(key, &path.span(), "the path of a file or folder")),
-            None => Err(self.source.error(table, format!("`{key}` is missing; legal: the path of a file or folder"))),
+    fn path(&self, key: &str, path: Value, table: &Range<usize>) -> Result<PathSetting, ConfigError> {
+        let legal = "the path of a file or folder, in quotes";
+        match (self.text(key, &path, legal, |p| !p.is_empty())?, path) {
+            (Some(text), Some(value)) => Ok(PathSetting { key: key.into(), span: value.span(), text }),
+            _ => Err(self.source.error(table, format!("`{key}` is missing; legal: {legal}"))),
         }
     }
 
-    fn whole(
+    /// The value if there is one and `read` finds it legal.
+    fn legal<T>(
         &self,
         key: &str,
-        value: &Option<Spanned<i64>>,
-        legal: RangeInclusive<i64>,
-    ) -> Result<Option<i64>, ConfigError> {
-        match value {
-            Some(v) if !legal.contains(v.get_ref()) => {
-                let legal = format!("a whole number from {} to {}", legal.start(), legal.end());
-                Err(self.value_error(key, &v.span(), &legal))
-            }
-            other => Ok(other.as_ref().map(|v| *v.get_ref())),
-        }
-    }
-
-    fn number(
-        &self,
-        key: &str,
-        value: &Option<Spanned<f64>>,
-        legal: RangeInclusive<f64>,
-    ) -> Result<Option<f64>, ConfigError> {
-        match value {
-            Some(v) if !legal.contains(v.get_ref()) => {
-                let unit = if key.ends_with("sigma") { ", in units of an 8-bit picture" } else { "" };
-                let legal = format!("a number from {} to {}{unit}", legal.start(), legal.end());
-                Err(self.value_error(key, &v.span(), &legal))
-            }
-            other => Ok(other.as_ref().map(|v| *v.get_ref())),
-        }
-    }
-
-    fn choice<T: Copy>(
-        &self,
-        key: &str,
-        value: &Option<Spanned<String>>,
-        legal: &[(&str, T)],
+        value: &Value,
+        legal: &str,
+        read: impl Fn(&Toml) -> Option<T>,
     ) -> Result<Option<T>, ConfigError> {
         let Some(v) = value else { return Ok(None) };
-        match legal.iter().find(|(name, _)| name == v.get_ref()) {
-            Some(&(_, choice)) => Ok(Some(choice)),
-            None => {
-                let names: Vec<&str> = legal.iter().map(|(name, _)| *name).collect();
-                Err(self.value_error(key, &v.span(), &names.join(", ")))
-            }
-        }
+        read(v.get_ref()).map(Some).ok_or_else(|| self.value_error(key, &v.span(), legal))
+    }
+
+    fn whole(&self, key: &str, value: &Value, range: RangeInclusive<i64>) -> Result<Option<i64>, ConfigError> {
+        let legal = match *range.end() {
+            i64::MAX => format!("a whole number of at least {}", range.start()),
+            end => format!("a whole number from {} to {end}", range.start()),
+        };
+        self.legal(key, value, &legal, |v| v.as_integer().filter(|i| range.contains(i)))
+    }
+
+    fn number(&self, key: &str, value: &Value, range: RangeInclusive<f64>) -> Result<Option<f64>, ConfigError> {
+        let unit = if key.ends_with("sigma") { ", in units of an 8-bit picture" } else { "" };
+        let legal = format!("a number from {} to {}{unit}", range.start(), range.end());
+        let as_number = |v: &Toml| v.as_float().or_else(|| v.as_integer().map(|i| i as f64));
+        self.legal(key, value, &legal, |v| as_number(v).filter(|x| range.contains(x)))
+    }
+
+    fn flag(&self, key: &str, value: &Value) -> Result<Option<bool>, ConfigError> {
+        self.legal(key, value, "true or false", Toml::as_bool)
+    }
+
+    fn text(
+        &self,
+        key: &str,
+        value: &Value,
+        legal: &str,
+        ok: impl Fn(&str) -> bool,
+    ) -> Result<Option<String>, ConfigError> {
+        self.legal(key, value, legal, |v| v.as_str().filter(|t| ok(t)).map(str::to_owned))
+    }
+
+    fn choice<T: Copy>(&self, key: &str, value: &Value, legal: &[(&str, T)]) -> Result<Option<T>, ConfigError> {
+        let names: Vec<&str> = legal.iter().map(|(name, _)| *name).collect();
+        self.legal(key, value, &names.join(", "), |v| {
+            legal.iter().find(|(name, _)| v.as_str() == Some(name)).map(|&(_, choice)| choice)
+        })
     }
 
     fn value_error(&self, key: &str, span: &Range<usize>, legal: &str) -> ConfigError {

@@ -11,27 +11,27 @@ use toml::de::{DeTable, DeValue, ValueDeserializer};
 
 use super::source::{ConfigError, Source};
 
-type Value<T> = Option<Spanned<T>>;
+/// A key's value with its place; the checks say what type and range is legal, in one message.
+pub type Value = Option<Spanned<toml::Value>>;
 
 /// Keys outside any table.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct TopKeys {
-    pub name: Value<String>,
-    pub seed: Value<i64>,
+    pub name: Value,
+    pub seed: Value,
 }
 
-/// `[data]`, `kind = "scene"`.
+/// `[data]` of either kind; `[data.keys]`, `[data.mask]` and `[data.noise]` are read apart.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
-pub struct SceneKeys {
-    pub path: Value<String>,
-    pub measurements: Option<Spanned<Vec<Spanned<i64>>>>,
-    pub keys: Option<PartNames>,
-    pub axes: Value<String>,
-    pub scale: Value<f64>,
+pub struct DataKeys {
+    pub path: Value,
+    pub measurements: Value,
+    pub axes: Value,
+    pub scale: Value,
 }
 
 /// `[data.keys]`: the names of a scene's parts in its file.
@@ -39,33 +39,20 @@ pub struct SceneKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct PartNames {
-    pub mask: Option<String>,
-    pub meas: Option<String>,
-    pub orig: Option<String>,
-    pub rgb: Option<String>,
-}
-
-/// `[data]`, `kind = "simulate"`; `[data.mask]` is read apart.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
-pub struct SimulateKeys {
-    pub path: Value<String>,
-    pub measurements: Option<Spanned<Vec<Spanned<i64>>>>,
-    pub keys: Option<PartNames>,
-    pub axes: Value<String>,
-    pub scale: Value<f64>,
-    pub noise: Option<NoiseKeys>,
+    pub mask: Value,
+    pub meas: Value,
+    pub orig: Value,
+    pub rgb: Value,
 }
 
 /// `[data.noise]`.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct NoiseKeys {
-    pub sigma: Value<f64>,
-    pub photons: Value<f64>,
-    pub seed: Value<i64>,
+    pub sigma: Value,
+    pub photons: Value,
+    pub seed: Value,
 }
 
 /// `[data.mask]`, `kind = "random"` or `"shifting"`.
@@ -73,9 +60,9 @@ pub struct NoiseKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct RandomMaskKeys {
-    pub frames: Value<i64>,
-    pub density: Value<f64>,
-    pub seed: Value<i64>,
+    pub frames: Value,
+    pub density: Value,
+    pub seed: Value,
 }
 
 /// `[data.mask]`, `kind = "file"`.
@@ -83,7 +70,7 @@ pub struct RandomMaskKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct FileMaskKeys {
-    pub path: Value<String>,
+    pub path: Value,
 }
 
 /// `[solver]`, `kind = "gap"`.
@@ -91,11 +78,11 @@ pub struct FileMaskKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct GapKeys {
-    pub accelerate: Value<bool>,
-    pub momentum: Value<String>,
-    pub start: Value<String>,
-    pub start_iterations: Value<i64>,
-    pub start_weight: Value<f64>,
+    pub accelerate: Value,
+    pub momentum: Value,
+    pub start: Value,
+    pub start_iterations: Value,
+    pub start_weight: Value,
 }
 
 /// `[solver]`, `kind = "admm"`.
@@ -103,10 +90,10 @@ pub struct GapKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct AdmmKeys {
-    pub gamma: Value<f64>,
-    pub start: Value<String>,
-    pub start_iterations: Value<i64>,
-    pub start_weight: Value<f64>,
+    pub gamma: Value,
+    pub start: Value,
+    pub start_iterations: Value,
+    pub start_weight: Value,
 }
 
 /// `[denoiser]`, `kind = "tv"`.
@@ -114,9 +101,9 @@ pub struct AdmmKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct TvKeys {
-    pub weight: Value<f64>,
-    pub inner: Value<i64>,
-    pub warm_dual: Value<bool>,
+    pub weight: Value,
+    pub inner: Value,
+    pub warm_dual: Value,
 }
 
 /// `[denoiser]`, `kind = "ffdnet"`.
@@ -124,7 +111,7 @@ pub struct TvKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct NetKeys {
-    pub weights: Value<String>,
+    pub weights: Value,
 }
 
 /// One `[[stage]]`; its own `denoiser` table is read apart.
@@ -132,8 +119,8 @@ pub struct NetKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct StageKeys {
-    pub sigma: Value<f64>,
-    pub iterations: Value<i64>,
+    pub sigma: Value,
+    pub iterations: Value,
 }
 
 /// `[stop]`.
@@ -141,8 +128,8 @@ pub struct StageKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct StopKeys {
-    pub relative_change: Value<f64>,
-    pub seconds: Value<f64>,
+    pub relative_change: Value,
+    pub seconds: Value,
 }
 
 /// `[skip]` and `[online]`.
@@ -150,7 +137,7 @@ pub struct StopKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct SwitchKeys {
-    pub enabled: Value<bool>,
+    pub enabled: Value,
 }
 
 /// `[output]`.
@@ -158,10 +145,10 @@ pub struct SwitchKeys {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct OutputKeys {
-    pub format: Value<String>,
-    pub frames: Value<bool>,
-    pub preview: Value<bool>,
-    pub fps: Value<i64>,
+    pub format: Value,
+    pub frames: Value,
+    pub preview: Value,
+    pub fps: Value,
 }
 
 /// A table on its way to a struct: its dotted key, its span, and what has not been taken out of it yet.
@@ -211,7 +198,10 @@ impl<'s> Section<'s> {
                 .enumerate()
                 .map(|(i, v)| self.section(format!("{}.{i}", self.key_of(key)), v))
                 .collect(),
-            _ => Err(self.source.error(&span, format!("`{key}` is a list of tables: write [[{key}]]"))),
+            _ => Err(self.source.error(
+                &span,
+                format!("`{key}` = {} is not legal; legal: a list of tables, [[{key}]]", self.source.snippet(&span)),
+            )),
         }
     }
 
@@ -219,10 +209,9 @@ impl<'s> Section<'s> {
         let span = value.span();
         match value.into_inner() {
             DeValue::Table(table) => Ok(Section { source: self.source, key, span, table }),
-            other => Err(self.source.error(
-                &span,
-                format!("`{key}` = {} is a {}, expected a table", self.source.snippet(&span), other.type_str()),
-            )),
+            _ => Err(self
+                .source
+                .error(&span, format!("`{key}` = {} is not legal; legal: a table", self.source.snippet(&span)))),
         }
     }
 
@@ -241,9 +230,10 @@ impl<'s> Section<'s> {
         let span = value.span();
         match value.get_ref().as_str() {
             Some(kind) if legal.contains(&kind) => Ok(Spanned::new(span, kind.to_owned())),
-            _ => Err(self
-                .source
-                .error(&span, format!("`{key}` = {}; legal: {}", self.source.snippet(&span), legal.join(", ")))),
+            _ => Err(self.source.error(
+                &span,
+                format!("`{key}` = {} is not legal; legal: {}", self.source.snippet(&span), legal.join(", ")),
+            )),
         }
     }
 
@@ -272,7 +262,7 @@ impl<'s> Section<'s> {
     /// Reads what is left into a struct that knows all its keys; `also` are keys taken out before.
     ///
     /// # Errors
-    /// An unknown key or a value of the wrong type.
+    /// An unknown key.
     pub fn read<T: DeserializeOwned>(self, also: &[&str]) -> Result<T, ConfigError> {
         let table = self.table.clone();
         let value = Spanned::new(self.span.clone(), DeValue::Table(table));
@@ -286,18 +276,7 @@ impl<'s> Section<'s> {
             let legal: Vec<&str> = legal.into_iter().chain(also.iter().copied()).collect();
             return self.unknown(&span, key, &legal);
         }
-        let (path, span) = find(&self.table, &span).unwrap_or((String::new(), span));
-        let key = if path.is_empty() { self.key.clone() } else { self.key_of(&path) };
-        let expected = message.rsplit_once("expected ").map_or(message, |(_, e)| e);
-        let expected = match expected {
-            "i64" => "a whole number",
-            "f64" => "a number",
-            "a string" => "text in quotes",
-            "a boolean" => "true or false",
-            other => other.trim_start_matches("struct "),
-        };
-        self.source
-            .error(&span, format!("`{key}` = {} is of the wrong type: expected {expected}", self.source.snippet(&span)))
+        self.source.error(&span, format!("`{}`: {message}", self.key))
     }
 }
 
@@ -305,24 +284,4 @@ impl<'s> Section<'s> {
 fn unknown_field(message: &str) -> Option<(&str, Vec<&str>)> {
     let mut quoted = message.strip_prefix("unknown field ")?.split('`').skip(1).step_by(2);
     Some((quoted.next()?, quoted.collect()))
-}
-
-/// The dotted key and span of the innermost value that covers a span.
-fn find(table: &DeTable<'_>, span: &Range<usize>) -> Option<(String, Range<usize>)> {
-    let covers = |outer: Range<usize>| outer.start <= span.start && span.end <= outer.end;
-    let below = |value: &Spanned<DeValue<'_>>| match value.get_ref() {
-        DeValue::Table(inner) => find(inner, span),
-        DeValue::Array(list) => {
-            list.iter().enumerate().find(|(_, v)| covers(v.span())).map(|(i, v)| (i.to_string(), v.span()))
-        }
-        _ => None,
-    };
-    table.iter().find_map(|(key, value)| {
-        let key = key.get_ref().as_ref();
-        match below(value) {
-            Some((path, span)) => Some((format!("{key}.{path}"), span)),
-            None if covers(value.span()) => Some((key.to_owned(), value.span())),
-            None => None,
-        }
-    })
 }

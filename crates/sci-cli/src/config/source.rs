@@ -211,11 +211,11 @@ mod tests {
     fn arguments_override_and_remember_themselves() {
         let s = source("x = 1\n[[stage]]\nsigma = 50\n", &["stage.0.sigma=25", "data.path=a.mat", "y=[1, {z=2}]"]);
         let tree = s.tree().unwrap();
-        let sigma = &tree["stage"].get_ref()[0]["sigma"];
+        let sigma = &tree["stage"].get_ref()[0].get_ref()["sigma"];
         assert_eq!(s.place(&sigma.span()), Place::Set("stage.0.sigma=25".into()));
         assert_eq!(s.snippet(&sigma.span()), "25");
         assert_eq!(tree["data"].get_ref()["path"].get_ref().as_str(), Some("a.mat"));
-        let z = &tree["y"].get_ref()[1]["z"];
+        let z = &tree["y"].get_ref()[1].get_ref()["z"];
         assert_eq!(s.snippet(&z.span()), "2");
         assert_eq!(s.place(&tree["x"].span()), Place::Line("a.toml".into(), 1));
     }

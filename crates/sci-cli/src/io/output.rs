@@ -180,7 +180,7 @@ pub struct Part<'a> {
     pub is_light: bool,
 }
 
-/// Writes arrays: `.npz` and `.mat` by name, `.npy` the first only. One channel loses its axis in `.npz` and `.mat`.
+/// Writes arrays: `.npz` and `.mat` by name, `.npy` the first only. A single channel keeps its axis only as video in `.npy`.
 ///
 /// `.mat` holds MATLAB's `[H, W, T]` (`[H, W, 3, T]` for color), light times 255, as scene files do.
 ///
@@ -189,7 +189,8 @@ pub struct Part<'a> {
 pub fn write_arrays(path: &Path, format: ArrayFormat, parts: &[Part<'_>]) -> Result<(), WriteError> {
     match format {
         ArrayFormat::Npy => write_atomically(path, |w| match parts.first() {
-            Some(part) => npy::write_npy(w, &part.data),
+            Some(part) if part.is_light => npy::write_npy(w, &part.data),
+            Some(part) => npy::write_npy(w, &without_single_channel(part.data)),
             None => Ok(()),
         }),
         ArrayFormat::Npz => write_atomically(path, |w| {

@@ -1,0 +1,59 @@
+//! Real scenes reach the numbers of the reference code, measured with its Python on the same files.
+
+use e2e::{Bench, data_root, workspace};
+
+/// Solves measurement 0 and compares with the reference.
+fn reaches(config: &str, scene: &str, psnr: f64, ssim: f64) {
+    let Some(root) = data_root() else { return };
+    let bench = Bench::new();
+    let config = workspace().join("configs/gray").join(config);
+    let mut command = bench.command(&["run", "--out", "out", "--set", "data.measurements=[0]"]);
+    command.arg("--set").arg(format!("data.path={scene}")).arg(config).env("SCI_DATA", root);
+    let run = bench.finish(&mut command);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let record = bench.record("out");
+    let m = &record["measurements"][0];
+    let (p, s) = (m["psnr_db"].as_f64().unwrap(), m["ssim"].as_f64().unwrap());
+    assert!((p - psnr).abs() <= 0.02, "PSNR {p}, reference {psnr}");
+    assert!((s - ssim).abs() <= 0.001, "SSIM {s}, reference {ssim}");
+    assert_eq!((m["iterations"].as_u64(), m["stop"].as_str()), (Some(40), Some("schedule_done")));
+    assert_eq!(m["trace"]["psnr_db"].as_array().map(Vec::len), Some(40));
+    assert_eq!(m["trace"]["psnr_db"][39].as_f64(), Some(p));
+}
+
+#[test]
+fn gap_tv_traffic() {
+    reaches("gap-tv.toml", "traffic48.mat", 20.764, 0.6873);
+}
+
+#[test]
+fn gap_tv_runner() {
+    reaches("gap-tv.toml", "runner40.mat", 29.806, 0.8949);
+}
+
+#[test]
+fn gap_ffdnet_traffic() {
+    reaches("gap-ffdnet.toml", "traffic48.mat", 23.708, 0.8222);
+}
+
+#[test]
+fn gap_ffdnet_runner() {
+    reaches("gap-ffdnet.toml", "runner40.mat", 32.443, 0.9312);
+}
+
+/// From the reference's start, the bias-only weights diverge; the result must be the last good estimate, marked.
+#[test]
+fn divergence_is_a_failure_with_a_result() {
+    let Some(root) = data_root() else { return };
+    let bench = Bench::new();
+    let mut command = bench.command(&["run", "--out", "out", "--set", "data.measurements=[0]"]);
+    command.args(["--set", "denoiser.weights=ffdnet_gray.pth"]).arg(workspace().join("configs/gray/gap-ffdnet.toml"));
+    let run = bench.finish(command.env("SCI_DATA", root));
+    assert_eq!(run.code, 1, "{}", run.stdout);
+    for needle in ["measurement 0 diverged in iteration", "solver.start = \"mean\"", "1 of 1 measurements diverged"] {
+        assert!(run.stderr.contains(needle), "{needle:?} is not in: {}", run.stderr);
+    }
+    let m = &bench.record("out")["measurements"][0];
+    assert_eq!(m["stop"], "diverged");
+    assert!(m["relative_residual"].is_number() && bench.path("out/recon.npy").is_file());
+}
