@@ -294,6 +294,11 @@ unsafe fn unpack_rows<S: Simd>(
                     let out = planes.add(c * plane + y * line + x);
                     if lanes == LANES && pixels == LANES {
                         S::transpose(p, LANES, out, plane);
+                        let mut k = 0;
+                        while k < LANES {
+                            S::prefetch(out.wrapping_add(k * plane + 4 * LANES));
+                            k += 1;
+                        }
                     } else {
                         let mut k = 0;
                         while k < lanes {
