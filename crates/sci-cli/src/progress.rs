@@ -30,7 +30,7 @@ impl Progress {
             return;
         }
         let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len}  {msg}  {eta} left")
-            .expect("the template is fixed and has only known keys");
+            .unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = ProgressBar::new(self.iterations as u64).with_style(style);
         bar.set_prefix(format!("measurement {:>2}", self.measurement));
         self.bar = Some(bar);

@@ -17,7 +17,7 @@ mod run;
 mod simulate;
 mod weights;
 
-use std::path::PathBuf;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -146,7 +146,7 @@ fn parse_density(text: &str) -> Result<f64, String> {
 }
 
 /// A path whose extension says how to write arrays.
-fn array_format(path: &PathBuf) -> anyhow::Result<crate::io::output::ArrayFormat> {
+fn array_format(path: &Path) -> anyhow::Result<crate::io::output::ArrayFormat> {
     crate::io::output::ArrayFormat::of(path).ok_or_else(|| {
         UsageError(format!("--out {}: expected a name that ends in .npy, .npz or .mat", path.display())).into()
     })

@@ -314,7 +314,7 @@ fn simulate(
     if count == 0 {
         return Err(SceneError::TooFewFrames { file: file.into(), frames, needed: b });
     }
-    if frames % b != 0 {
+    if !frames.is_multiple_of(b) {
         warnings
             .push(format!("the last {} of {frames} frames fill no measurement of {b} and are left out", frames % b));
     }
@@ -333,7 +333,7 @@ fn simulate(
 pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     let file = path.display().to_string();
     let keys = &reading.keys;
-    let (mut found, format) = if path.is_dir() {
+    let (found, format) = if path.is_dir() {
         (read_folder(path, keys)?, Format::Npy)
     } else {
         let bytes = read_file(path)?;
@@ -341,29 +341,23 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
             .map_err(|e| FileError::new(path, e))?
             .ok_or_else(|| SceneError::NotAScene { file: file.clone(), what: "a single array or video" })?
     };
-    let missing = |key: &str, part| SceneError::MissingKey {
-        file: file.clone(),
-        key: key.into(),
-        part,
-        present: found.names.clone(),
-    };
-    if !found.arrays.contains_key(&keys.mask) {
-        return Err(missing(&keys.mask, "the masks"));
-    }
-    if !found.arrays.contains_key(&keys.meas) && !found.arrays.contains_key(&keys.orig) {
-        if found.arrays.contains_key(&keys.rgb) {
-            return Err(SceneError::ColorOnly { file, key: keys.rgb.clone() });
-        }
-        return Err(missing(&keys.meas, "measurements, or `orig` to simulate them from"));
-    }
+    let NamedArrays { names, mut arrays } = found;
     let mut part = |key: &str, scale: Option<f32>| -> Result<Option<Array3<f32>>, SceneError> {
-        found.arrays.remove(key).map(|a| to_frames(&file, key, a, format, reading.axes, scale)).transpose()
+        arrays.remove(key).map(|a| to_frames(&file, key, a, format, reading.axes, scale)).transpose()
     };
-    let mask = part(&keys.mask, Some(1.0))?.map(normalise_mask);
+    let mask = part(&keys.mask, Some(1.0))?;
     let meas = part(&keys.meas, reading.scale)?;
     let orig = part(&keys.orig, reading.scale)?;
-    let mask = mask.expect("presence was checked above");
-    Scene::new(&file, keys, mask, meas, orig)
+    let missing =
+        |key: &str, part| SceneError::MissingKey { file: file.clone(), key: key.into(), part, present: names.clone() };
+    let mask = mask.ok_or_else(|| missing(&keys.mask, "the masks"))?;
+    if meas.is_none() && orig.is_none() {
+        return Err(match arrays.contains_key(&keys.rgb) {
+            true => SceneError::ColorOnly { file, key: keys.rgb.clone() },
+            false => missing(&keys.meas, "measurements, or `orig` to simulate them from"),
+        });
+    }
+    Scene::new(&file, keys, normalise_mask(mask), meas, orig)
 }
 
 /// Masks saved as black-and-white images run to 255.
@@ -467,8 +461,9 @@ pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Array3<f32>, Sc
         Format::Npy => gray_array(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
         Format::Mat | Format::Npz => {
             let keys = &reading.keys;
-            let (mut found, format) =
-                read_container(&bytes, &[&keys.orig, &keys.rgb]).map_err(read_error)?.expect("this format is one");
+            let (mut found, format) = read_container(&bytes, &[&keys.orig, &keys.rgb])
+                .map_err(read_error)?
+                .ok_or_else(|| read_error(ReadError::UnknownFormat))?;
             let key = if found.arrays.contains_key(&keys.orig) { &keys.orig } else { &keys.rgb };
             let Some(array) = found.arrays.remove(key) else {
                 return Err(SceneError::MissingKey {

@@ -1,6 +1,6 @@
 //! Owns video files: animated GIF (read and write) and Y4M (read).
 
-use std::io::{BufRead, Cursor, Write};
+use std::io::{Cursor, Write};
 
 use image::{AnimationDecoder, ImageDecoder, Limits, codecs::gif::GifDecoder};
 use ndarray::ArrayView4;
@@ -108,17 +108,15 @@ pub fn read_y4m(bytes: &[u8]) -> Result<Array, ReadError> {
 
 /// Checks the sizes in the header line, which the decoder multiplies unchecked; says whether samples use all of 0 to 255.
 fn check_y4m_header(bytes: &[u8]) -> Result<bool, ReadError> {
-    let mut line = Vec::new();
-    (&bytes[..bytes.len().min(4096)]).read_until(b'\n', &mut line).map_err(ReadError::Io)?;
-    let line = String::from_utf8_lossy(&line);
+    let line = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
+    let line = String::from_utf8_lossy(line);
+    let side = |field: &str| field.strip_prefix('W').or_else(|| field.strip_prefix('H')).map(str::parse::<usize>);
     for field in line.split_ascii_whitespace().skip(1) {
-        if let Some(side) = field.strip_prefix('W').or_else(|| field.strip_prefix('H')) {
-            if !side.parse::<usize>().is_ok_and(|n| (1..=MAX_SIDE).contains(&n)) {
-                return Err(ReadError::Malformed {
-                    format: Y4M,
-                    reason: format!("header field {field:?}: a side is 1 to {MAX_SIDE} pixels"),
-                });
-            }
+        if side(field).is_some_and(|n| !n.is_ok_and(|n| (1..=MAX_SIDE).contains(&n))) {
+            return Err(ReadError::Malformed {
+                format: Y4M,
+                reason: format!("header field {field:?}: a side is 1 to {MAX_SIDE} pixels"),
+            });
         }
     }
     Ok(line.contains("XCOLORRANGE=FULL"))
