@@ -80,8 +80,7 @@ impl<D: Denoiser> Solver for Gap<D> {
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<(), BoxError> {
         let GapState { x, v, previous, y1 } = state;
         std::mem::swap(previous, v);
-        let momentum = y1.as_mut().map(|y1| y1.view_mut());
-        let step = DataStep { y: problem.y(), damping: 0.0, momentum };
+        let step = DataStep { y: problem.y(), damping: 0.0, momentum: y1.as_mut() };
         problem.operator().data_step(step, previous.view(), x.view_mut());
         self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), v.view_mut().insert_axis(Axis(1)))
     }

@@ -38,7 +38,7 @@ fn operator(c: &mut Criterion) {
         group.bench_function("accelerated projection", |b| {
             b.iter(|| {
                 operator.data_step(
-                    DataStep { y: measured.view(), damping: 0.0, momentum: Some(y1.view_mut()) },
+                    DataStep { y: measured.view(), damping: 0.0, momentum: Some(&mut y1) },
                     x.view(),
                     copy.view_mut(),
                 )

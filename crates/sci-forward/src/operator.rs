@@ -10,6 +10,7 @@ use ndarray::parallel::prelude::*;
 use ndarray::{
     Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, ArrayViewMut3, Axis, Zip,
 };
+use std::borrow::Cow;
 
 /// Rows of one parallel task.
 const BAND: usize = 16;
@@ -51,7 +52,7 @@ pub trait SensingOperator: Send + Sync {
         let mut hx = self.forward(from);
         let residual = Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + f64::from(y - hx).powi(2));
         match momentum {
-            Some(mut y1) => Zip::from(&mut hx).and(y).and(&mut y1).for_each(|hx, &y, y1| {
+            Some(y1) => Zip::from(&mut hx).and(y).and(y1).for_each(|hx, &y, y1| {
                 *y1 += y - *hx;
                 *hx = *y1 - *hx;
             }),
@@ -118,8 +119,8 @@ pub struct DataStep<'a> {
     pub y: ArrayView2<'a, f32>,
     /// γ ≥ 0.
     pub damping: f32,
-    /// The accumulated measurement `y1` `[H, W]` of accelerated GAP, updated in place.
-    pub momentum: Option<ArrayViewMut2<'a, f32>>,
+    /// The accumulated measurement `y1` `[H, W]` of accelerated GAP, in row-major order, updated in place.
+    pub momentum: Option<&'a mut Array2<f32>>,
 }
 
 /// `H` of coded-exposure video: `y = Σ_t C_t ⊙ x_t`, `diag(H Hᵀ) = Σ_t C_t²`.
@@ -200,10 +201,15 @@ impl SensingOperator for MaskOperator {
         let DataStep { y, damping, momentum } = step;
         self.check(from.dim(), y.dim());
         self.check(to.dim(), y.dim());
-        // Without momentum every band is handed an empty piece of an empty array.
-        let mut none = Array2::zeros((y.nrows(), 0));
-        let mut y1 = momentum.unwrap_or(none.view_mut());
-        assert!(y1.is_empty() || y1.dim() == y.dim(), "the momentum must have the measurement's size");
+        let width = y.ncols();
+        let momentum: Vec<Option<&mut [f32]>> = match momentum {
+            Some(y1) => {
+                assert_eq!(y1.dim(), y.dim(), "the momentum must have the measurement's size");
+                let y1 = y1.as_slice_mut().expect("the momentum must be in row-major order");
+                y1.chunks_mut(BAND * width).map(Some).collect()
+            }
+            None => (0..y.nrows().div_ceil(BAND)).map(|_| None).collect(),
+        };
         let residuals: Vec<f64> = to
             .axis_chunks_iter_mut(Axis(1), BAND)
             .into_par_iter()
@@ -211,17 +217,16 @@ impl SensingOperator for MaskOperator {
             .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
             .zip(self.gram.axis_chunks_iter(Axis(0), BAND))
             .zip(y.axis_chunks_iter(Axis(0), BAND))
-            .zip(y1.axis_chunks_iter_mut(Axis(0), BAND))
+            .zip(momentum)
             .map(|(((((mut to, from), c), gram), y), mut y1)| {
                 let mut local = Local::new(from.dim().0);
-                let mut residual = 0.0;
-                for row in 0..y.nrows() {
+                let rows = 0..y.nrows();
+                rows.fold(0.0, |residual, row| {
                     let target = Target { gram: gram.row(row), y: y.row(row), damping };
+                    let y1 = y1.as_mut().map(|y1| &mut y1[row * width..][..width]);
                     let to = to.index_axis_mut(Axis(1), row);
-                    residual +=
-                        data_step_row(rows_at(c, row), rows_at(from, row), to, target, y1.row_mut(row), &mut local);
-                }
-                residual
+                    residual + data_step_row(rows_at(c, row), rows_at(from, row), to, target, y1, &mut local)
+                })
             })
             .collect();
         residuals.iter().sum()
@@ -237,10 +242,10 @@ impl SensingOperator for MaskOperator {
             .zip(previous.axis_chunks_iter(Axis(1), BAND))
             .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
             .map(|(((y, x), previous), c)| {
-                let mut hx = Array2::zeros((1, y.ncols()));
+                let mut hx = vec![0.0; y.ncols()];
                 (0..y.nrows()).fold(Progress::default(), |sum, row| {
                     let (x, previous) = (rows_at(x, row), rows_at(previous, row));
-                    sum.plus(progress_row(rows_at(c, row), x, previous, y.row(row), hx.row_mut(0)))
+                    sum.plus(progress_row(rows_at(c, row), x, previous, y.row(row), &mut hx))
                 })
             })
             .collect();
@@ -305,56 +310,47 @@ fn data_step_row(
     from: ArrayView2<'_, f32>,
     mut to: ArrayViewMut2<'_, f32>,
     target: Target<'_>,
-    mut y1: ArrayViewMut1<'_, f32>,
+    mut y1: Option<&mut [f32]>,
     local: &mut Local,
 ) -> f64 {
-    let (frames, width) = from.dim();
+    let (_, width) = from.dim();
+    let (gram, y) = (packed(target.gram), packed(target.y));
     let mut coefficients = [0f32; CHUNK];
     let mut residual = 0.0;
     for start in (0..width).step_by(CHUNK) {
-        let count = CHUNK.min(width - start);
-        let columns = ndarray::s![start..start + count];
+        let columns = start..(start + CHUNK).min(width);
+        let count = columns.len();
         let coefficients = &mut coefficients[..count];
         coefficients.fill(0.0);
-        for t in 0..frames {
-            let (x, c) = (from.row(t).slice_move(columns), c.row(t).slice_move(columns));
-            let (video, masks) = (&mut local.video[t * count..][..count], &mut local.masks[t * count..][..count]);
-            copy(x, video);
-            copy(c, masks);
-            add_product(coefficients, masks, video);
+        for (t, (x, c)) in from.outer_iter().zip(c.outer_iter()).enumerate() {
+            let local = (&mut local.video[t * count..][..count], &mut local.masks[t * count..][..count]);
+            add_product_and_keep(coefficients, &packed(c)[columns.clone()], &packed(x)[columns.clone()], local);
         }
-        for (i, v) in coefficients.iter_mut().enumerate() {
-            let x = start + i;
-            let error = target.y[x] - *v;
-            residual += f64::from(error).powi(2);
-            let towards = match y1.get_mut(x) {
-                Some(y1) => {
-                    *y1 += error;
-                    *y1 - *v
-                }
-                None => error,
-            };
-            *v = if target.gram[x] > CLOSED { towards / (target.gram[x] + target.damping) } else { 0.0 };
-        }
-        for t in 0..frames {
+        let (y, gram) = (&y[columns.clone()], &gram[columns.clone()]);
+        residual += match &mut y1 {
+            None => coefficients_of(coefficients, y, gram, target.damping),
+            Some(y1) => accelerated_coefficients(coefficients, y, gram, target.damping, &mut y1[columns.clone()]),
+        };
+        for (t, mut to) in to.outer_iter_mut().enumerate() {
             let (video, masks) = (&local.video[t * count..][..count], &local.masks[t * count..][..count]);
-            let mut to = to.row_mut(t).slice_move(columns);
             match to.as_slice_mut() {
-                Some(to) => write_sum(to, video, masks, coefficients),
-                None => to
-                    .iter_mut()
-                    .zip(video.iter().zip(masks.iter().zip(&*coefficients)))
-                    .for_each(|(to, (x, (c, v)))| *to = x + c * v),
+                Some(to) => write_sum(&mut to[columns.clone()], video, masks, coefficients),
+                None => {
+                    let sums = video.iter().zip(masks.iter().zip(&*coefficients)).map(|(x, (c, v))| x + c * v);
+                    to.iter_mut().skip(start).zip(sums).for_each(|(to, sum)| *to = sum);
+                }
             }
         }
     }
     residual
 }
 
-fn copy(from: ArrayView1<'_, f32>, to: &mut [f32]) {
-    match from.as_slice() {
-        Some(from) => to.copy_from_slice(from),
-        None => to.iter_mut().zip(from).for_each(|(to, from)| *to = *from),
+/// Adds `c x` to `sum`, and copies `x` and `c` to `kept`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn add_product_and_keep(sum: &mut [f32], c: &[f32], x: &[f32], kept: (&mut [f32], &mut [f32])) {
+    for ((((sum, c), x), kept_x), kept_c) in sum.iter_mut().zip(c).zip(x).zip(kept.0).zip(kept.1) {
+        *sum += c * x;
+        (*kept_x, *kept_c) = (*x, *c);
     }
 }
 
@@ -366,44 +362,95 @@ fn write_sum(to: &mut [f32], x: &[f32], c: &[f32], v: &[f32]) {
     }
 }
 
+/// Turns `H x` of a chunk into `(y − H x) / (gram + damping)`. Returns `Σ (y − H x)²`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn coefficients_of(hx: &mut [f32], y: &[f32], gram: &[f32], damping: f32) -> f64 {
+    let residual = squared_distance(hx, y);
+    for ((hx, y), gram) in hx.iter_mut().zip(y).zip(gram) {
+        *hx = if *gram > CLOSED { (y - *hx) / (gram + damping) } else { 0.0 };
+    }
+    residual
+}
+
+/// As [`coefficients_of`], but adds `y − H x` to `y1` and aims at that.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn accelerated_coefficients(hx: &mut [f32], y: &[f32], gram: &[f32], damping: f32, y1: &mut [f32]) -> f64 {
+    let residual = squared_distance(hx, y);
+    for (((hx, y), gram), y1) in hx.iter_mut().zip(y).zip(gram).zip(y1) {
+        *y1 += y - *hx;
+        *hx = if *gram > CLOSED { (*y1 - *hx) / (gram + damping) } else { 0.0 };
+    }
+    residual
+}
+
+/// `Σ (a − b)²` over lanes.
+#[inline(always)]
+fn squared_distance(a: &[f32], b: &[f32]) -> f64 {
+    let mut sums = [0f32; LANES];
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..LANES {
+            sums[lane] += (a[lane] - b[lane]) * (a[lane] - b[lane]);
+        }
+    }
+    for (lane, (a, b)) in a_rest.iter().zip(b_rest).enumerate() {
+        sums[lane] += (a - b) * (a - b);
+    }
+    sums.iter().map(|&v| f64::from(v)).sum()
+}
+
+/// The numbers as a slice, copied only if they are not one already.
+fn packed(row: ArrayView1<'_, f32>) -> Cow<'_, [f32]> {
+    match row.to_slice() {
+        Some(row) => Cow::Borrowed(row),
+        None => Cow::Owned(row.to_vec()),
+    }
+}
+
 /// [`SensingOperator::progress`] of one row; `c`, `x` and `previous` are `[T, W]`, and `hx` is scratch.
 fn progress_row(
     c: ArrayView2<'_, f32>,
     x: ArrayView2<'_, f32>,
     previous: ArrayView2<'_, f32>,
     y: ArrayView1<'_, f32>,
-    mut hx: ArrayViewMut1<'_, f32>,
+    hx: &mut [f32],
 ) -> Progress {
-    forward_row(c, x, hx.view_mut());
-    let residual = Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + f64::from(y - hx).powi(2));
-    let (change, norm) = x.outer_iter().zip(previous.outer_iter()).fold((0.0, 0.0), |(change, norm), (x, previous)| {
-        let (c, n) = match (x.as_slice(), previous.as_slice()) {
-            (Some(x), Some(previous)) => change_and_norm(x, previous),
-            _ => change_and_norm(&x.to_vec(), &previous.to_vec()),
-        };
-        (change + f64::from(c), norm + f64::from(n))
-    });
-    Progress { residual, change, norm }
+    hx.fill(0.0);
+    let (mut change, mut norm) = ([0f32; LANES], [0f32; LANES]);
+    for ((c, x), previous) in c.outer_iter().zip(x.outer_iter()).zip(previous.outer_iter()) {
+        add_progress(hx, &packed(c), &packed(x), &packed(previous), &mut change, &mut norm);
+    }
+    let residual = squared_distance(hx, &packed(y));
+    let sum = |lanes: [f32; LANES]| lanes.iter().map(|&v| f64::from(v)).sum();
+    Progress { residual, change: sum(change), norm: sum(norm) }
 }
 
-/// `(‖x − previous‖², ‖x‖²)`.
+/// Adds `c x` to `hx`, `(x − previous)²` to `change` and `x²` to `norm`, all in one reading of `x`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn change_and_norm(x: &[f32], previous: &[f32]) -> (f32, f32) {
-    let (mut change, mut norm) = ([0f32; LANES], [0f32; LANES]);
-    let (chunks, rest) = x.as_chunks::<LANES>();
-    let (previous_chunks, previous_rest) = previous.as_chunks::<LANES>();
-    for (x, previous) in chunks.iter().zip(previous_chunks) {
+fn add_progress(
+    hx: &mut [f32],
+    c: &[f32],
+    x: &[f32],
+    previous: &[f32],
+    change: &mut [f32; LANES],
+    norm: &mut [f32; LANES],
+) {
+    let ((hx, hx_rest), (c, c_rest)) = (hx.as_chunks_mut::<LANES>(), c.as_chunks::<LANES>());
+    let ((x, x_rest), (previous, previous_rest)) = (x.as_chunks::<LANES>(), previous.as_chunks::<LANES>());
+    let (mut changes, mut norms) = (*change, *norm);
+    for (((hx, c), x), previous) in hx.iter_mut().zip(c).zip(x).zip(previous) {
         for lane in 0..LANES {
-            let d = x[lane] - previous[lane];
-            change[lane] += d * d;
-            norm[lane] += x[lane] * x[lane];
+            hx[lane] += c[lane] * x[lane];
+            changes[lane] += (x[lane] - previous[lane]) * (x[lane] - previous[lane]);
+            norms[lane] += x[lane] * x[lane];
         }
     }
-    for (lane, (x, previous)) in rest.iter().zip(previous_rest).enumerate() {
-        change[lane] += (x - previous) * (x - previous);
-        norm[lane] += x * x;
+    for (lane, (((hx, c), x), previous)) in hx_rest.iter_mut().zip(c_rest).zip(x_rest).zip(previous_rest).enumerate() {
+        *hx += c * x;
+        changes[lane] += (x - previous) * (x - previous);
+        norms[lane] += x * x;
     }
-    (change.iter().sum(), norm.iter().sum())
+    (*change, *norm) = (changes, norms);
 }
 
 #[cfg(test)]
@@ -467,14 +514,14 @@ mod tests {
                 for accelerated in [false, true] {
                     let run = |operator: &dyn SensingOperator| {
                         let (mut to, mut y1) = (x.mapv(|_| f32::NAN), y.mapv(|v| v * 0.5));
-                        let momentum = accelerated.then(|| y1.view_mut());
+                        let momentum = accelerated.then_some(&mut y1);
                         let residual = operator.data_step(DataStep { y: y.view(), damping, momentum }, x.view(), to.view_mut());
                         (to, y1, residual)
                     };
                     let ((x, y1, residual), (nx, ny1, nresidual)) = (run(&fast), run(&naive));
                     prop_assert_eq!(x, nx);
                     prop_assert_eq!(y1, ny1);
-                    prop_assert!((residual - nresidual).abs() <= 1e-9 * nresidual);
+                    prop_assert!((residual - nresidual).abs() <= 1e-5 * nresidual);
                 }
                 let previous = uniform(shape.dim(), seed + 2);
                 let (fast, naive) = (fast.progress(y.view(), x.view(), previous.view()), naive.progress(y.view(), x.view(), previous.view()));
