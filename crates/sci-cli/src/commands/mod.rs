@@ -50,7 +50,7 @@ enum Command {
     /// Look into weight files
     #[command(subcommand)]
     Weights(weights::Command),
-    /// Render report.html of finished runs again, and compare them
+    /// Compare finished runs
     Report(report::Args),
 }
 

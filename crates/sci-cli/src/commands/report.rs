@@ -1,4 +1,4 @@
-//! `sci report`: the report pages of finished runs again, and a table of them.
+//! `sci report`: a table of finished runs.
 
 use std::path::PathBuf;
 

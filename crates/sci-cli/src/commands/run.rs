@@ -45,6 +45,8 @@ impl Args {
         scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
         let chosen = choose(&experiment, &scene)?;
         let mut factory = Factory::new(&experiment)?;
+        // A folder that cannot be written should not be found out after hours of solving.
+        drop(Staging::new(&out)?);
         announce(&experiment, &scene, chosen.len());
         let results = solve_all(&experiment, &scene, &chosen, &mut factory)?;
         if results.is_empty() {
