@@ -100,7 +100,7 @@ impl Ddnet {
     }
 
     /// The RGB video of sparse RGGB frames, both `[T, 3, H, W]`.
-    fn infer(&mut self, sparse: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<()> {
+    pub(crate) fn infer(&mut self, sparse: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<()> {
         let device = self.device();
         if device.is_cpu() {
             return self.net.infer(sparse, 0.0, out);

@@ -229,7 +229,7 @@ impl Network for Ffdnet {
         let (n, _, h, w) = check_clips(self, clips, noise)?;
         // [N, C, H, W] -> [N, 4C, H/2, W/2] -> [N, 4C + 1, H/2, W/2]
         let z = pixel_unshuffle(&Padding::Replicate.pad(clips, 2)?, 2)?;
-        let map = noise_map(n, noise, (z.dim(2)?, z.dim(3)?), z.device())?;
+        let map = noise_map(n, noise, &z)?;
         let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
         let mut z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
         for layer in &self.layers {

@@ -19,10 +19,13 @@ mod ddnet;
 mod error;
 mod fastdvdnet;
 mod ffdnet;
+#[cfg(test)]
+mod gradient_tests;
 mod infer;
 pub mod kernels;
 mod layers;
 mod network;
+pub mod train;
 mod video;
 pub mod weights;
 

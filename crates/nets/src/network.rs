@@ -145,16 +145,13 @@ pub(crate) fn copy_to(tensor: &Tensor, mut out: ArrayViewMut4<'_, f32>) -> candl
     Ok(())
 }
 
-/// The σ of each frame as a map `[N, 1, H, W]`.
-pub(crate) fn noise_map(
-    frames: usize,
-    noise: &[f32],
-    (height, width): (usize, usize),
-    device: &Device,
-) -> candle_core::Result<Tensor> {
+/// The σ of each frame as a map `[N, 1, H, W]` of the size and kind of `beside`.
+pub(crate) fn noise_map(frames: usize, noise: &[f32], beside: &Tensor) -> candle_core::Result<Tensor> {
+    let (_, _, height, width) = beside.dims4()?;
     let per_clip = frames / noise.len();
     let values: Vec<f32> = (0..frames).map(|n| noise[n / per_clip]).collect();
-    Tensor::from_vec(values, (frames, 1, 1, 1), device)?.broadcast_as((frames, 1, height, width))?.contiguous()
+    let map = Tensor::from_vec(values, (frames, 1, 1, 1), beside.device())?.to_dtype(beside.dtype())?;
+    map.broadcast_as((frames, 1, height, width))?.contiguous()
 }
 
 /// How a frame is continued beyond its last row and column.

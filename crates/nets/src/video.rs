@@ -17,7 +17,8 @@ use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis
 const FEATURES_PER_FRAME: usize = 30;
 
 /// What stands for the frames before the first and after the last.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Ends {
     /// The other end of the sequence, as the reference reconstruction code has it.
     #[default]
@@ -203,14 +204,13 @@ impl VideoNet {
     }
 
     fn stage(&self, block: &Block, x: &Tensor, triplets: &[[usize; 3]], noise: &[f32]) -> candle_core::Result<Tensor> {
-        let (_, _, h, w) = x.dims4()?;
         let pick = |k: usize| {
             let index: Vec<u32> = triplets.iter().map(|t| t[k] as u32).collect();
             x.index_select(&Tensor::new(index, x.device())?, 0)
         };
         let frames = [pick(0)?, pick(1)?, pick(2)?];
         let input = if self.spec.noise_map {
-            let map = noise_map(triplets.len(), noise, (h, w), x.device())?;
+            let map = noise_map(triplets.len(), noise, x)?;
             Tensor::cat(&[&frames[0], &map, &frames[1], &map, &frames[2], &map], 1)?
         } else {
             Tensor::cat(&frames, 1)?

@@ -203,11 +203,15 @@ pub fn write_safetensors(path: &Path, tensors: &BTreeMap<String, Tensor>, storag
     let tensors =
         tensors.iter().map(|(name, t)| Ok((name.as_str(), t.to_dtype(dtype)?))).collect::<Result<Vec<_>>>()?;
     let bytes = safetensors::serialize(tensors, None).map_err(|e| Error::format(path, e.to_string()))?;
-    write_atomically(path, &bytes)
+    write_atomically(path, &bytes, |_| Ok(()))
 }
 
-/// Writes to a temporary name beside `path`, then renames.
-pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+/// Writes to a temporary name beside `path`, then renames; `before` runs between the two.
+pub(crate) fn write_atomically(
+    path: &Path,
+    bytes: &[u8],
+    before: impl FnOnce(&Path) -> std::io::Result<()>,
+) -> Result<()> {
     let fail = |source| Error::Write { path: path.to_owned(), source };
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".tmp");
@@ -216,6 +220,7 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
         let mut file = std::fs::File::create(&temporary)?;
         std::io::Write::write_all(&mut file, bytes)?;
         file.sync_all()?;
+        before(path)?;
         std::fs::rename(&temporary, path)
     };
     write().map_err(fail)

@@ -1,0 +1,254 @@
+//! What a training run is: a plain, checked description that a TOML file maps to one to one.
+
+use crate::video::Ends;
+use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// A training run. Noise levels are in 0..255 units here, as in every TOML file, and in `[0, 1]` everywhere else.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Name of the run, and of the weights it makes.
+    pub name: String,
+    /// Seed of everything random: initial weights, crops, motion, noise. Default 0.
+    #[serde(default)]
+    pub seed: u64,
+    /// What is trained.
+    pub network: NetworkConfig,
+    /// What it is trained on.
+    pub data: DataConfig,
+    /// The noise put on its input.
+    pub noise: NoiseConfig,
+    /// How it is trained.
+    pub training: TrainingConfig,
+    /// How it is watched.
+    #[serde(default)]
+    pub validation: ValidationConfig,
+    /// When it is saved.
+    #[serde(default)]
+    pub checkpoint: CheckpointConfig,
+}
+
+/// The network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum NetworkConfig {
+    /// [`Ffdnet`](crate::Ffdnet), direct layout.
+    Ffdnet {
+        /// 1 gray, 3 RGB.
+        channels: usize,
+        /// Channels of the hidden layers, 1 to 1024.
+        width: usize,
+        /// Convolutions, 2 to 100.
+        depth: usize,
+    },
+    /// [`Fastdvdnet`](crate::Fastdvdnet), biases in place of batch norm.
+    Fastdvdnet {
+        /// 1 gray, 3 RGB.
+        channels: usize,
+        /// Channels at full, half and quarter size, each 1 to 1024.
+        widths: [usize; 3],
+        /// Neighbours of the end frames. Default circular.
+        #[serde(default)]
+        ends: Ends,
+    },
+    /// [`Ddnet`](crate::Ddnet).
+    Ddnet {
+        /// Channels at full, half and quarter size, each 1 to 1024.
+        widths: [usize; 3],
+        /// Neighbours of the end frames. Default circular.
+        #[serde(default)]
+        ends: Ends,
+    },
+}
+
+impl NetworkConfig {
+    /// Colors of a frame: 1 or 3.
+    pub fn channels(&self) -> usize {
+        match *self {
+            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } => channels,
+            Self::Ddnet { .. } => 3,
+        }
+    }
+
+    pub(super) fn ffdnet(channels: usize, width: usize, depth: usize) -> FfdnetSpec {
+        FfdnetSpec { channels, width, depth, layout: FfdnetLayout::Direct }
+    }
+
+    pub(super) fn fastdvdnet(channels: usize, widths: [usize; 3]) -> FastdvdnetSpec {
+        FastdvdnetSpec { channels, widths, batch_norm: false }
+    }
+
+    pub(super) fn ddnet(widths: [usize; 3]) -> DdnetSpec {
+        DdnetSpec { widths }
+    }
+}
+
+/// Where the frames are and how training clips are cut from them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataConfig {
+    /// A folder of folders of frames.
+    pub video: Option<PathBuf>,
+    /// A folder of photographs, which a synthetic camera moves into clips.
+    pub photos: Option<PathBuf>,
+    /// A folder of folders of frames that are never trained on.
+    pub validation: PathBuf,
+    /// Share of the training clips that is made from photographs, 0 to 1. Default 0.5.
+    #[serde(default = "half")]
+    pub photo_share: f64,
+    /// Side of the square patches in pixels: a multiple of 4, 4 to 1024.
+    pub patch: usize,
+    /// Frames of a clip, 1 to 64: whole clips go through a video network at once. Default 1.
+    #[serde(default = "one")]
+    pub frames: usize,
+    /// Clips in a batch, 1 to 1024.
+    pub batch: usize,
+}
+
+/// The noise on the input, white and Gaussian.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoiseConfig {
+    /// Range of σ in 0..255 units, one value drawn uniformly for each clip.
+    pub sigma: [f32; 2],
+}
+
+/// The optimisation: Adam, warm-up and cosine decay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingConfig {
+    /// Steps in all, at least 1.
+    pub steps: u64,
+    /// What is minimised. Default L1.
+    #[serde(default)]
+    pub loss: Loss,
+    /// Highest learning rate, above 0 and at most 1.
+    pub learning_rate: f64,
+    /// Learning rate at the last step, 0 to `learning_rate`. Default 0.
+    #[serde(default)]
+    pub final_learning_rate: f64,
+    /// Steps over which the learning rate rises from 0. Default 0.
+    #[serde(default)]
+    pub warmup: u64,
+    /// Decay per step of the moving average of the weights that is validated and exported, 0 to below 1. Default 0.999.
+    #[serde(default = "average")]
+    pub average: f64,
+    /// Longest gradient (Euclidean norm over all weights); longer ones are shortened to it. Above 0; default 1.
+    #[serde(default = "unit")]
+    pub clip_norm: f64,
+}
+
+/// The mean over all values of a function of the error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Loss {
+    /// Absolute error.
+    #[default]
+    L1,
+    /// Squared error.
+    L2,
+}
+
+/// PSNR on held-out clips.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ValidationConfig {
+    /// Steps between validations, at least 1. Default 1000.
+    pub every: u64,
+    /// Noise levels in 0..255 units. Default 10, 25, 50.
+    pub sigmas: Vec<f32>,
+    /// Frames of each clip that count, from the first; at least 1. Default 16.
+    pub frames: usize,
+}
+
+impl Default for ValidationConfig {
+    fn default() -> Self {
+        Self { every: 1000, sigmas: vec![10.0, 25.0, 50.0], frames: 16 }
+    }
+}
+
+/// Saving.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CheckpointConfig {
+    /// Steps between checkpoints, at least 1. Default 500.
+    pub every: u64,
+}
+
+impl Default for CheckpointConfig {
+    fn default() -> Self {
+        Self { every: 500 }
+    }
+}
+
+fn half() -> f64 {
+    0.5
+}
+fn one() -> usize {
+    1
+}
+fn average() -> f64 {
+    0.999
+}
+fn unit() -> f64 {
+    1.0
+}
+
+impl TrainConfig {
+    /// Checks every value against its range.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for the first value out of range.
+    pub fn validate(&self) -> Result<()> {
+        let (data, training) = (&self.data, &self.training);
+        let named = !self.name.is_empty() && self.name.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c));
+        check(named, "name", &self.name, "letters, digits, '_', '-' and '.'; it becomes a file name")?;
+        let sources = data.video.is_some() || data.photos.is_some();
+        check(sources, "data", "neither video nor photos", "at least one of them must be given")?;
+        check((0.0..=1.0).contains(&data.photo_share), "data.photo_share", data.photo_share, "0 to 1")?;
+        let patch = (4..=1024).contains(&data.patch) && data.patch % 4 == 0;
+        check(patch, "data.patch", data.patch, "a multiple of 4 from 4 to 1024")?;
+        check((1..=64).contains(&data.frames), "data.frames", data.frames, "1 to 64")?;
+        check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
+        let [low, high] = self.noise.sigma;
+        check(level(low) && level(high) && low <= high, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
+        check(training.steps >= 1, "training.steps", training.steps, "at least 1")?;
+        let rate = training.learning_rate;
+        check(rate > 0.0 && rate <= 1.0, "training.learning_rate", rate, "above 0 and at most 1")?;
+        let last = training.final_learning_rate;
+        check((0.0..=rate).contains(&last), "training.final_learning_rate", last, "0 to training.learning_rate")?;
+        check(training.warmup <= training.steps, "training.warmup", training.warmup, "at most training.steps")?;
+        check((0.0..1.0).contains(&training.average), "training.average", training.average, "0 to below 1")?;
+        let clip = training.clip_norm;
+        check(clip.is_finite() && clip > 0.0, "training.clip_norm", clip, "above 0 and finite")?;
+        check(self.validation.every >= 1, "validation.every", self.validation.every, "at least 1")?;
+        check(self.validation.frames >= 1, "validation.frames", self.validation.frames, "at least 1")?;
+        for &sigma in &self.validation.sigmas {
+            check(level(sigma), "validation.sigmas", sigma, "each 0 to 255")?;
+        }
+        check(self.checkpoint.every >= 1, "checkpoint.every", self.checkpoint.every, "at least 1")
+    }
+
+    /// The learning rate of a step, counted from 0: a linear rise, then half a cosine.
+    pub fn learning_rate(&self, step: u64) -> f64 {
+        let TrainingConfig { steps, learning_rate, final_learning_rate, warmup, .. } = self.training;
+        if step < warmup {
+            return learning_rate * (step + 1) as f64 / warmup as f64;
+        }
+        let progress = (step - warmup) as f64 / (steps - warmup).saturating_sub(1).max(1) as f64;
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos());
+        final_learning_rate + (learning_rate - final_learning_rate) * cosine
+    }
+}
+
+const LEVELS: &str = "two levels from 0 to 255, the lower one first";
+
+fn level(sigma: f32) -> bool {
+    (0.0..=255.0).contains(&sigma)
+}
+
+fn check(holds: bool, key: &'static str, value: impl std::fmt::Display, legal: &str) -> Result<()> {
+    if holds { Ok(()) } else { Err(Error::Setting { key, value: value.to_string(), legal: legal.to_owned() }) }
+}

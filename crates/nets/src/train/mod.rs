@@ -1,0 +1,17 @@
+//! Training: seeded, resumable bit for bit, on frames that the caller decodes.
+//!
+//! [`Trainer`] owns one run; the caller loops over [`Trainer::step`], validates and saves when it likes.
+
+mod adam;
+mod checkpoint;
+mod config;
+mod data;
+mod noise;
+mod step;
+
+pub use adam::Adam;
+pub use config::{
+    CheckpointConfig, DataConfig, Loss, NetworkConfig, NoiseConfig, TrainConfig, TrainingConfig, ValidationConfig,
+};
+pub use data::{Frame, TrainData, frame_from_rgb};
+pub use step::{Resumed, Score, StepReport, Trainer};

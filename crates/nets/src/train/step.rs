@@ -1,0 +1,386 @@
+//! The training loop's body.
+
+use super::adam::Adam;
+use super::checkpoint::{self, Meta};
+use super::config::{Loss, NetworkConfig, TrainConfig};
+use super::data::{TrainData, to_video};
+use super::noise::{add_noise, sensor};
+use crate::weights::{Storage, write_safetensors};
+use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
+use admm::{DenoiseCx, Denoiser};
+use candle_core::{Device, Tensor, Var};
+use ndarray::{Array4, ArrayView4, Axis, concatenate};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sci_forward::metrics::psnr;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What a step did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// Its number, counted from 1.
+    pub step: u64,
+    /// The loss before it.
+    pub loss: f32,
+    /// The learning rate.
+    pub learning_rate: f64,
+    /// Norm of the gradient before it was shortened.
+    pub gradient_norm: f64,
+}
+
+/// Mean PSNR over the frames of all validation clips.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Score {
+    /// σ in 0..255 units.
+    pub sigma: f32,
+    /// PSNR of the result in dB, data range 1.
+    pub psnr_db: f64,
+}
+
+/// How [`Trainer::resume`] found its state.
+#[derive(Debug)]
+pub struct Resumed {
+    /// The file it was read from.
+    pub from: PathBuf,
+    /// Why the newest checkpoint was refused, if it was.
+    pub refused: Option<Error>,
+}
+
+/// The network that is trained.
+#[derive(Clone)]
+enum Model {
+    Ffdnet(Ffdnet),
+    Fastdvdnet(Fastdvdnet),
+    Ddnet(Ddnet),
+}
+
+impl Model {
+    fn random(config: &NetworkConfig, seed: u64) -> Result<Self> {
+        Ok(match *config {
+            NetworkConfig::Ffdnet { channels, width, depth } => {
+                Self::Ffdnet(Ffdnet::random(NetworkConfig::ffdnet(channels, width, depth), seed)?)
+            }
+            NetworkConfig::Fastdvdnet { channels, widths, ends } => {
+                Self::Fastdvdnet(Fastdvdnet::random(NetworkConfig::fastdvdnet(channels, widths), ends, seed)?)
+            }
+            NetworkConfig::Ddnet { widths, ends } => {
+                Self::Ddnet(Ddnet::random(NetworkConfig::ddnet(widths), ends, seed)?)
+            }
+        })
+    }
+
+    fn network(&self) -> &dyn Network {
+        match self {
+            Self::Ffdnet(net) => net,
+            Self::Fastdvdnet(net) => net,
+            Self::Ddnet(net) => net,
+        }
+    }
+
+    fn network_mut(&mut self) -> &mut dyn Network {
+        match self {
+            Self::Ffdnet(net) => net,
+            Self::Fastdvdnet(net) => net,
+            Self::Ddnet(net) => net,
+        }
+    }
+
+    /// The input of the network for noisy frames.
+    fn input(&self, noisy: Array4<f32>) -> Array4<f32> {
+        if matches!(self, Self::Ddnet(_)) { sensor(noisy.view()) } else { noisy }
+    }
+
+    /// Runs the network without gradients.
+    fn restore(&mut self, input: ArrayView4<'_, f32>, sigma: f32) -> Result<Array4<f32>> {
+        let mut out = Array4::zeros(input.dim());
+        let cx = DenoiseCx { sigma, iteration: 0, stage: 0 };
+        let fail = |e: admm::BoxError| Error::Data(e.to_string());
+        match self {
+            Self::Ffdnet(net) => net.denoise(&cx, input, out.view_mut()).map_err(fail)?,
+            Self::Fastdvdnet(net) => net.denoise(&cx, input, out.view_mut()).map_err(fail)?,
+            Self::Ddnet(net) => net.infer(input, out.view_mut())?,
+        }
+        Ok(out)
+    }
+}
+
+/// One training run.
+///
+/// ```
+/// use nets::train::*;
+/// # let frame = |seed: usize| Frame::from_shape_fn((1, 12, 12), |(_, y, x)| ((7 * y + 5 * x + seed) % 97) as u8);
+/// let config: TrainConfig = serde_json::from_str(r#"{
+///     "name": "tiny",
+///     "network": { "kind": "ffdnet", "channels": 1, "width": 4, "depth": 3 },
+///     "data": { "photos": "photos", "validation": "validation", "photo_share": 1.0, "patch": 8, "batch": 2 },
+///     "noise": { "sigma": [0, 50] },
+///     "training": { "steps": 3, "learning_rate": 1e-3 }
+/// }"#)?;
+/// let data = TrainData { photos: vec![frame(0), frame(1)], validation: vec![vec![frame(2)]], ..Default::default() };
+/// let mut trainer = Trainer::new(config, data)?;
+/// while !trainer.finished() {
+///     assert!(trainer.step()?.loss.is_finite());
+/// }
+/// assert_eq!(trainer.validate()?.len(), 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Trainer {
+    config: TrainConfig,
+    data: TrainData,
+    model: Model,
+    vars: Vec<(String, Var)>,
+    adam: Adam,
+    average: Vec<Vec<f32>>,
+    step: u64,
+}
+
+impl std::fmt::Debug for Trainer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Trainer").field("config", &self.config).field("step", &self.step).finish_non_exhaustive()
+    }
+}
+
+/// Streams of the generator: the steps take the ones from 0.
+const VALIDATION_STREAM: u64 = 1 << 63;
+
+impl Trainer {
+    /// A run at its beginning.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for a value out of range, [`Error::Data`] for unusable data.
+    pub fn new(config: TrainConfig, data: TrainData) -> Result<Self> {
+        config.validate()?;
+        data.check(config.network.channels(), config.data.photo_share)?;
+        let mut model = Model::random(&config.network, config.seed)?;
+        let vars = model.network_mut().make_trainable()?;
+        let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
+        let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        Ok(Self { config, data, model, vars, adam, average, step: 0 })
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// What is trained, with its size.
+    pub fn describe(&self) -> String {
+        self.model.network().describe()
+    }
+
+    /// Number of trained values.
+    pub fn parameter_count(&self) -> usize {
+        self.model.network().parameter_count()
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> u64 {
+        self.step
+    }
+
+    /// Whether all steps are done.
+    pub fn finished(&self) -> bool {
+        self.step >= self.config.training.steps
+    }
+
+    /// The generator of a step (or of a validation): the same after a resume as in one go.
+    fn rng(&self, stream: u64) -> ChaCha8Rng {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
+        rng.set_stream(stream);
+        rng
+    }
+
+    /// Clean clips, what the network sees of them, σ of each; `[batch · T, C, P, P]`.
+    fn batch(&self) -> Result<(Tensor, Tensor, Vec<f32>)> {
+        let data = &self.config.data;
+        let [low, high] = self.config.noise.sigma.map(|s| s / 255.0);
+        // Stream 0 initialised the weights.
+        let mut rng = self.rng(self.step + 1);
+        let (mut clean, mut seen, mut sigmas) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..data.batch {
+            let clip = self.data.clip(&mut rng, data.frames, data.patch, data.photo_share);
+            let sigma = low + (high - low) * rng.random::<f32>();
+            let mut noisy = clip.clone();
+            add_noise(&mut noisy, sigma, &mut rng);
+            seen.push(self.model.input(noisy));
+            clean.push(clip);
+            sigmas.push(sigma);
+        }
+        Ok((stack(&clean)?, stack(&seen)?, sigmas))
+    }
+
+    /// One step of the optimiser on a new batch.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the step.
+    pub fn step(&mut self) -> Result<StepReport> {
+        let (clean, seen, sigmas) = self.batch()?;
+        let error = (self.model.network().forward(&seen, &sigmas)? - clean)?;
+        let loss = match self.config.training.loss {
+            Loss::L1 => error.abs()?,
+            Loss::L2 => error.sqr()?,
+        }
+        .mean_all()?;
+        let value = loss.to_scalar::<f32>()?;
+        let diverged = Error::Diverged { step: self.step + 1, loss: value };
+        if !value.is_finite() {
+            return Err(diverged);
+        }
+        let learning_rate = self.config.learning_rate(self.step);
+        let gradient_norm = self.adam.step(&loss.backward()?, learning_rate, self.config.training.clip_norm)?;
+        if !gradient_norm.is_finite() {
+            return Err(diverged);
+        }
+        self.step += 1;
+        self.update_average()?;
+        Ok(StepReport { step: self.step, loss: value, learning_rate, gradient_norm })
+    }
+
+    fn update_average(&mut self) -> Result<()> {
+        // Shorter at first, so that the random beginning is forgotten.
+        let started = (1 + self.step) as f64 / (10 + self.step) as f64;
+        let decay = self.config.training.average.min(started) as f32;
+        for ((_, var), average) in self.vars.iter().zip(&mut self.average) {
+            for (a, w) in average.iter_mut().zip(values(var)?) {
+                *a = decay * *a + (1.0 - decay) * w;
+            }
+        }
+        Ok(())
+    }
+
+    /// The averaged weights under their published names: what a run is for.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub fn weights(&self) -> Result<BTreeMap<String, Tensor>> {
+        let mut state = self.model.network().state();
+        for ((name, var), average) in self.vars.iter().zip(&self.average) {
+            state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
+        }
+        Ok(state)
+    }
+
+    /// Writes [`Trainer::weights`] as `.safetensors`.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn export(&self, path: &Path, storage: Storage) -> Result<()> {
+        write_safetensors(path, &self.weights()?, storage)
+    }
+
+    /// PSNR of the averaged weights on the first frames of the held-out clips, for each noise level of the settings.
+    /// The noise is the same every time.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub fn validate(&self) -> Result<Vec<Score>> {
+        let mut model = self.model.clone();
+        let mut weights = self.weights()?;
+        for conv in model.network_mut().convs_mut() {
+            for (name, tensor, _) in conv.tensors_mut() {
+                if let Some(average) = weights.remove(&name) {
+                    *tensor = average;
+                }
+            }
+        }
+        let settings = &self.config.validation;
+        let mut scores = Vec::new();
+        for &sigma in &settings.sigmas {
+            let (mut sum, mut count) = (0.0, 0);
+            for (i, clip) in self.data.validation.iter().enumerate() {
+                let clean = to_video(clip, settings.frames);
+                let mut noisy = clean.clone();
+                add_noise(&mut noisy, sigma / 255.0, &mut self.rng(VALIDATION_STREAM + i as u64));
+                let restored = model.restore(model.input(noisy).view(), sigma / 255.0)?;
+                for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
+                    sum += frame_psnr(clean, restored);
+                    count += 1;
+                }
+            }
+            scores.push(Score { sigma, psnr_db: sum / f64::from(count) });
+        }
+        Ok(scores)
+    }
+
+    /// Writes a checkpoint; the one that was there is kept as `NAME.previous.safetensors`.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let mut tensors = BTreeMap::new();
+        let moments = self.adam.state()?;
+        for (((name, var), average), (m, v)) in self.vars.iter().zip(&self.average).zip(moments) {
+            tensors.insert(format!("weights/{name}"), var.as_detached_tensor());
+            tensors.insert(format!("average/{name}"), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
+            tensors.insert(format!("first/{name}"), m);
+            tensors.insert(format!("second/{name}"), v);
+        }
+        checkpoint::write(path, &Meta::new(self.step, self.adam.steps(), self.config.clone()), &tensors)
+    }
+
+    /// Continues from a checkpoint, or from the one before it when the newest is damaged.
+    ///
+    /// # Errors
+    /// The newest checkpoint's error when neither can be used, or when it is of a run with other settings.
+    pub fn resume(&mut self, path: &Path) -> Result<Resumed> {
+        match checkpoint::read(path) {
+            Ok(found) => {
+                self.restore(path, found)?;
+                Ok(Resumed { from: path.to_owned(), refused: None })
+            }
+            Err(error) => {
+                let before = checkpoint::previous(path);
+                let Ok(found) = checkpoint::read(&before) else { return Err(error) };
+                self.restore(&before, found)?;
+                Ok(Resumed { from: before, refused: Some(error) })
+            }
+        }
+    }
+
+    fn restore(&mut self, path: &Path, (meta, mut tensors): (Meta, BTreeMap<String, Tensor>)) -> Result<()> {
+        checkpoint::check_same_run(path, &meta.config, &self.config)?;
+        let mut take = |kind: &str, name: &str, var: &Var| -> Result<Vec<f32>> {
+            let key = format!("{kind}/{name}");
+            let tensor = tensors.remove(&key).filter(|t| t.shape() == var.shape());
+            let tensor = tensor.ok_or_else(|| Error::format(path, format!("{key} is missing or of another shape")))?;
+            Ok(tensor.flatten_all()?.to_vec1()?)
+        };
+        let (mut weights, mut averages, mut moments) = (Vec::new(), Vec::new(), Vec::new());
+        for (name, var) in &self.vars {
+            weights.push(take("weights", name, var)?);
+            averages.push(take("average", name, var)?);
+            moments.push((take("first", name, var)?, take("second", name, var)?));
+        }
+        // Only now that all is there does anything change.
+        for ((_, var), weights) in self.vars.iter().zip(weights) {
+            var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
+        }
+        self.average = averages;
+        self.adam.restore(meta.adam_steps, moments);
+        self.step = meta.step;
+        Ok(())
+    }
+}
+
+fn values(var: &Var) -> Result<Vec<f32>> {
+    Ok(var.flatten_all()?.to_vec1()?)
+}
+
+/// Clips of equal shape, one after another.
+fn stack(clips: &[Array4<f32>]) -> Result<Tensor> {
+    let views: Vec<_> = clips.iter().map(|clip| clip.view()).collect();
+    let all = concatenate(Axis(0), &views).map_err(|e| Error::Data(e.to_string()))?;
+    let shape = all.dim();
+    Ok(Tensor::from_vec(all.into_raw_vec_and_offset().0, shape, &Device::Cpu)?)
+}
+
+/// Over all channels of a frame.
+fn frame_psnr(clean: ndarray::ArrayView3<'_, f32>, restored: ndarray::ArrayView3<'_, f32>) -> f64 {
+    let (c, h, w) = clean.dim();
+    let flat = |a: ndarray::ArrayView3<'_, f32>| a.to_shape((c * h, w)).map(|a| a.into_owned());
+    match (flat(clean), flat(restored)) {
+        (Ok(clean), Ok(restored)) => psnr(clean.view(), restored.view()),
+        _ => f64::NAN,
+    }
+}

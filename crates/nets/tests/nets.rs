@@ -1,0 +1,294 @@
+//! Behaviour of the networks that needs no published weights.
+
+use admm::{DenoiseCx, Denoiser};
+use candle_core::{Device, Tensor};
+use ndarray::{Array3, Array4, Axis, concatenate, s};
+use nets::weights::{Architecture, Storage, convert, write_safetensors};
+use nets::{
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, WeightFile,
+};
+use sci_forward::{CfaPattern, Demosaicer};
+use std::path::Path;
+
+const CX: DenoiseCx = DenoiseCx { sigma: 0.1, iteration: 0, stage: 0 };
+
+fn pattern(dim: (usize, usize, usize, usize)) -> Array4<f32> {
+    Array4::from_shape_fn(dim, |(t, c, y, x)| ((13 * t + 7 * c + 5 * y + 3 * x) % 23) as f32 / 23.0)
+}
+
+fn tiny_ffdnet(channels: usize) -> Ffdnet {
+    Ffdnet::random(FfdnetSpec { channels, width: 6, depth: 3, layout: FfdnetLayout::Direct }, 1).unwrap()
+}
+
+fn tiny_fastdvdnet(channels: usize, ends: Ends) -> Fastdvdnet {
+    Fastdvdnet::random(FastdvdnetSpec { channels, widths: [4, 5, 6], batch_norm: true }, ends, 2).unwrap()
+}
+
+fn tiny_ddnet() -> Ddnet {
+    Ddnet::random(DdnetSpec { widths: [4, 5, 6] }, Ends::Circular, 3).unwrap()
+}
+
+fn denoise(net: &mut dyn Denoiser, video: &Array4<f32>) -> Array4<f32> {
+    let mut out = Array4::from_elem(video.dim(), f32::NAN);
+    net.denoise(&CX, video.view(), out.view_mut()).unwrap();
+    out
+}
+
+/// The differentiable pass, which works on whole tensors.
+fn by_tensors(net: &dyn Network, video: &Array4<f32>) -> Array4<f32> {
+    let x = Tensor::from_slice(video.as_slice().unwrap(), video.dim(), &Device::Cpu).unwrap();
+    let y = net.forward(&x, &[CX.sigma]).unwrap();
+    Array4::from_shape_vec(video.dim(), y.flatten_all().unwrap().to_vec1().unwrap()).unwrap()
+}
+
+#[track_caller]
+fn assert_close(a: &Array4<f32>, b: &Array4<f32>, tolerance: f32) {
+    assert_eq!(a.dim(), b.dim());
+    let worst = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(worst <= tolerance && a.iter().all(|v| v.is_finite()), "differ by {worst:e}");
+}
+
+const ODD_SIZES: [(usize, usize); 6] = [(1, 1), (1, 9), (9, 1), (3, 5), (2, 6), (33, 31)];
+
+#[test]
+fn frames_of_any_size_pass_and_both_paths_agree() {
+    for (h, w) in ODD_SIZES {
+        for frames in [1, 2, 3, 5] {
+            let (gray, rgb) = (pattern((frames, 1, h, w)), pattern((frames, 3, h, w)));
+            let mut ffdnet = tiny_ffdnet(1);
+            assert_close(&denoise(&mut ffdnet, &gray), &by_tensors(&ffdnet, &gray), 1e-5);
+            for ends in [Ends::Circular, Ends::Mirrored] {
+                let mut net = tiny_fastdvdnet(3, ends);
+                assert_close(&denoise(&mut net, &rgb), &by_tensors(&net, &rgb), 1e-5);
+            }
+            let mosaic = rgb.index_axis(Axis(1), 0);
+            for cfa in [CfaPattern::Rggb, CfaPattern::Bggr, CfaPattern::Grbg, CfaPattern::Gbrg] {
+                let mut out = Array4::from_elem(rgb.dim(), f32::NAN);
+                tiny_ddnet().demosaic(cfa, mosaic, out.view_mut()).unwrap();
+                assert!(out.iter().all(|v| v.is_finite()));
+            }
+        }
+    }
+}
+
+#[test]
+fn a_large_odd_frame_passes() {
+    let video = pattern((1, 1, 255, 257));
+    let mut ffdnet = tiny_ffdnet(1);
+    assert_close(&denoise(&mut ffdnet, &video), &by_tensors(&ffdnet, &video), 1e-5);
+    let mut fastdvdnet = tiny_fastdvdnet(1, Ends::Circular);
+    assert_close(&denoise(&mut fastdvdnet, &video), &by_tensors(&fastdvdnet, &video), 1e-5);
+    let mut rgb = Array4::from_elem((1, 3, 255, 257), f32::NAN);
+    tiny_ddnet().demosaic(CfaPattern::Grbg, video.index_axis(Axis(1), 0), rgb.view_mut()).unwrap();
+    assert!(rgb.iter().all(|v| v.is_finite()));
+}
+
+#[test]
+fn sharing_the_first_stage_changes_no_bit() {
+    // A window of its own for every frame: four blocks a frame, of which the middle result is kept.
+    for ends in [Ends::Circular, Ends::Mirrored] {
+        let mut net = tiny_fastdvdnet(1, ends);
+        let video = pattern((6, 1, 8, 12));
+        let shared = denoise(&mut net, &video);
+        for t in 0..6isize {
+            let window: Vec<_> = (t - 2..=t + 2)
+                .map(|i| match ends {
+                    Ends::Circular => i.rem_euclid(6) as usize,
+                    Ends::Mirrored => {
+                        if i < 0 {
+                            -i as usize
+                        } else {
+                            i.min(10 - i) as usize
+                        }
+                    }
+                })
+                .map(|i| video.slice(s![i..=i, .., .., ..]))
+                .collect();
+            let window = concatenate(Axis(0), &window).unwrap();
+            // The middle of five frames does not see their ends.
+            let alone = denoise(&mut net, &window);
+            assert_eq!(alone.index_axis(Axis(0), 2), shared.index_axis(Axis(0), t as usize), "frame {t}, {ends:?}");
+        }
+    }
+}
+
+#[test]
+fn nan_and_infinity_pass_through_without_a_crash() {
+    for poison in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut gray = pattern((3, 1, 9, 9));
+        gray[[1, 0, 4, 4]] = poison;
+        for net in [&mut tiny_ffdnet(1) as &mut dyn Denoiser, &mut tiny_fastdvdnet(1, Ends::Circular)] {
+            let out = denoise(net, &gray);
+            assert!(out.iter().any(|v| !v.is_finite()), "the poison is not hidden");
+        }
+        let mut rgb = Array4::zeros((3, 3, 9, 9));
+        tiny_ddnet().demosaic(CfaPattern::Rggb, gray.index_axis(Axis(1), 0), rgb.view_mut()).unwrap();
+    }
+}
+
+#[test]
+fn wrong_channels_shapes_and_noise_levels_are_refused_by_name() {
+    let rgb = pattern((2, 3, 4, 4));
+    let mut out = Array4::zeros(rgb.dim());
+    let error = tiny_ffdnet(1).denoise(&CX, rgb.view(), out.view_mut()).unwrap_err().to_string();
+    assert_eq!(error, "FFDNet (gray, 6 channels, 3 layers) takes videos of 1 channel(s), this one has 3");
+    let mut small = Array4::zeros((2, 3, 4, 3));
+    let error = tiny_fastdvdnet(3, Ends::Circular).denoise(&CX, rgb.view(), small.view_mut()).unwrap_err().to_string();
+    assert!(error.contains("[2, 3, 4, 4]") && error.contains("[2, 3, 4, 3]"), "{error}");
+    for sigma in [-1.0, f32::NAN] {
+        let cx = DenoiseCx { sigma, ..CX };
+        let error = tiny_ffdnet(3).denoise(&cx, rgb.view(), out.view_mut()).unwrap_err().to_string();
+        assert!(error.contains("noise level"), "{error}");
+    }
+    let mosaic = Array3::zeros((2, 4, 5));
+    let error = tiny_ddnet().demosaic(CfaPattern::Rggb, mosaic.view(), out.view_mut()).unwrap_err().to_string();
+    assert!(error.contains("[2, 3, 4, 5]"), "{error}");
+    for spec in [FfdnetSpec { channels: 2, ..FfdnetSpec::GRAY }, FfdnetSpec { width: 0, ..FfdnetSpec::GRAY }] {
+        assert!(matches!(Ffdnet::random(spec, 0), Err(Error::Setting { .. })));
+    }
+}
+
+#[test]
+fn an_empty_video_is_no_work() {
+    let empty = Array4::<f32>::zeros((0, 1, 4, 4));
+    assert_eq!(denoise(&mut tiny_ffdnet(1), &empty).len(), 0);
+    assert_eq!(denoise(&mut tiny_fastdvdnet(1, Ends::Mirrored), &empty).len(), 0);
+}
+
+#[test]
+fn changing_a_variable_changes_what_the_denoiser_does() {
+    let video = pattern((2, 1, 8, 8));
+    for mut net in [Box::new(tiny_ffdnet(1)) as Box<dyn Both>, Box::new(tiny_fastdvdnet(1, Ends::Circular))] {
+        let before = denoise(net.denoiser(), &video);
+        let vars = net.network().make_trainable().unwrap();
+        assert_eq!(denoise(net.denoiser(), &video), before);
+        let (_, last) = vars.last().unwrap();
+        last.set(&(last.as_tensor() + 0.5).unwrap()).unwrap();
+        assert_ne!(denoise(net.denoiser(), &video), before);
+    }
+}
+
+trait Both {
+    fn denoiser(&mut self) -> &mut dyn Denoiser;
+    fn network(&mut self) -> &mut dyn Network;
+}
+impl<N: Denoiser + Network> Both for N {
+    fn denoiser(&mut self) -> &mut dyn Denoiser {
+        self
+    }
+    fn network(&mut self) -> &mut dyn Network {
+        self
+    }
+}
+
+#[test]
+fn weights_survive_a_file_and_are_recognised() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("net.safetensors");
+    let nets: [(Box<dyn Network>, Architecture); 4] = [
+        (Box::new(tiny_ffdnet(3)), Architecture::Ffdnet(tiny_ffdnet(3).spec())),
+        (
+            Box::new(tiny_fastdvdnet(1, Ends::Circular)),
+            Architecture::Fastdvdnet(tiny_fastdvdnet(1, Ends::Circular).spec()),
+        ),
+        (
+            Box::new(tiny_fastdvdnet(3, Ends::Circular)),
+            Architecture::Fastdvdnet(tiny_fastdvdnet(3, Ends::Circular).spec()),
+        ),
+        (Box::new(tiny_ddnet()), Architecture::Ddnet(tiny_ddnet().spec())),
+    ];
+    for (net, architecture) in nets {
+        write_safetensors(&path, &net.state(), Storage::F32).unwrap();
+        let file = WeightFile::read(&path).unwrap();
+        assert_eq!(file.architecture().unwrap(), architecture);
+        let read = nets::weights::network(file).unwrap();
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for ((name, a), (other, b)) in net.state().iter().zip(&read.state()) {
+            assert_eq!((name, values(a)), (other, values(b)));
+        }
+    }
+}
+
+#[test]
+fn half_precision_storage_is_read_and_close() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("half.safetensors");
+    let mut net = tiny_ffdnet(1);
+    write_safetensors(&path, &net.state(), Storage::F16).unwrap();
+    assert!(WeightFile::read(&path).unwrap().summary().iter().all(|t| t.dtype == "F16"));
+    let video = pattern((1, 1, 8, 8));
+    assert_close(&denoise(&mut Ffdnet::load(&path).unwrap(), &video), &denoise(&mut net, &video), 5e-3);
+}
+
+#[test]
+fn folding_on_conversion_keeps_the_function() {
+    let folder = tempfile::tempdir().unwrap();
+    let (plain, folded) = (folder.path().join("a.safetensors"), folder.path().join("b.safetensors"));
+    let mut net = tiny_fastdvdnet(1, Ends::Circular);
+    write_safetensors(&plain, &net.state(), Storage::F32).unwrap();
+    convert(&plain, &folded, true, Storage::F32).unwrap();
+    let mut read = Fastdvdnet::load(&folded, Ends::Circular).unwrap();
+    assert!(!read.spec().batch_norm);
+    let video = pattern((3, 1, 8, 8));
+    assert_close(&denoise(&mut read, &video), &denoise(&mut net, &video), 1e-6);
+    let error = convert(&plain, &folder.path().join("c.pth"), false, Storage::F32).unwrap_err().to_string();
+    assert!(error.contains("safetensors"), "{error}");
+}
+
+#[test]
+fn wrong_weights_are_refused_with_file_and_keys_in_one_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bad.safetensors");
+    let write = |tensors| write_safetensors(&path, &tensors, Storage::F32).unwrap();
+    let refused = || Ffdnet::load(&path).unwrap_err().to_string();
+
+    let mut state = tiny_ffdnet(1).state();
+    let bias = state.remove("model.2.bias").unwrap();
+    state.insert("model.2.scale".into(), bias.clone());
+    state.insert("model.0.bias".into(), Tensor::zeros(7, candle_core::DType::F32, &Device::Cpu).unwrap());
+    write(state);
+    let error = refused();
+    for part in [
+        "bad.safetensors",
+        "missing model.2.bias",
+        "unexpected model.2.scale",
+        "model.0.bias (expected [6], found [7])",
+    ] {
+        assert!(error.contains(part), "{part} is not in: {error}");
+    }
+
+    let mut state = tiny_ffdnet(1).state();
+    state.insert("model.0.bias".into(), Tensor::new(&[0f32, 1.0, f32::NAN, 0.0, 0.0, 0.0], &Device::Cpu).unwrap());
+    write(state);
+    assert!(refused().contains("model.0.bias holds NaN"), "{}", refused());
+
+    write(tiny_ddnet().state());
+    assert!(refused().contains("DDNet (4/5/6 channels), not of FFDNet"), "{}", refused());
+    write([("x".to_owned(), bias)].into());
+    assert!(refused().contains("no known network"), "{}", refused());
+    let error = Ffdnet::load(Path::new("bundled:nothing")).unwrap_err().to_string();
+    assert!(error.contains("no bundled weights \"nothing\""), "{error}");
+    assert!(matches!(Ffdnet::load(&folder.path().join("absent.pth")), Err(Error::Read { .. })));
+}
+
+#[test]
+fn a_weight_file_cut_anywhere_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("net.safetensors");
+    write_safetensors(&path, &tiny_ffdnet(1).state(), Storage::F32).unwrap();
+    let mut files = vec![std::fs::read(&path).unwrap()];
+    let shared = std::env::var_os("SCI_DATA").map_or(Path::new("../../../shared").to_owned(), Into::into);
+    for name in ["ffdnet_gray.pth", "fastdvdnet_half_color.pth"] {
+        match std::fs::read(shared.join("weights").join(name)) {
+            Ok(bytes) => files.push(bytes),
+            Err(_) => println!("{name} skipped: not in SCI_DATA"),
+        }
+    }
+    for bytes in files {
+        for part in 0..16 {
+            let cut = &bytes[..bytes.len() * part / 16];
+            let read = WeightFile::parse(Path::new("cut"), cut);
+            assert!(read.is_err(), "{} of {} bytes", cut.len(), bytes.len());
+        }
+    }
+}

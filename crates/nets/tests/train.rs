@@ -1,0 +1,249 @@
+//! Training: it learns, it resumes bit for bit, and it refuses damaged checkpoints.
+
+use nets::train::*;
+use nets::{Error, WeightFile};
+
+fn photo(channels: usize, seed: usize) -> Frame {
+    Frame::from_shape_fn((channels, 40, 36), |(c, y, x)| {
+        let wave = ((y * (seed % 5 + 2)) as f32 * 0.11 + c as f32).sin() + ((x + 3 * seed) as f32 * 0.17).cos();
+        (127.0 + 60.0 * wave) as u8
+    })
+}
+
+fn data(channels: usize) -> TrainData {
+    let video = |seed: usize| (0..6).map(|t| photo(channels, seed + t)).collect::<Vec<_>>();
+    TrainData {
+        videos: vec![video(0), video(7)],
+        photos: (0..4).map(|i| photo(channels, i)).collect(),
+        validation: vec![video(20)],
+    }
+}
+
+fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
+    TrainConfig {
+        name: "test".into(),
+        seed: 3,
+        network,
+        data: DataConfig {
+            video: Some("video".into()),
+            photos: Some("photos".into()),
+            validation: "validation".into(),
+            photo_share: 0.5,
+            patch: 16,
+            frames,
+            batch: 2,
+        },
+        noise: NoiseConfig { sigma: [0.0, 50.0] },
+        training: TrainingConfig {
+            steps,
+            loss: Loss::L1,
+            learning_rate: 2e-3,
+            final_learning_rate: 0.0,
+            warmup: steps.min(2),
+            average: 0.9,
+            clip_norm: 1.0,
+        },
+        validation: ValidationConfig { sigmas: vec![25.0], frames: 2, ..ValidationConfig::default() },
+        checkpoint: CheckpointConfig::default(),
+    }
+}
+
+const FFDNET: NetworkConfig = NetworkConfig::Ffdnet { channels: 1, width: 8, depth: 3 };
+const FASTDVDNET: NetworkConfig =
+    NetworkConfig::Fastdvdnet { channels: 1, widths: [4, 4, 4], ends: nets::Ends::Circular };
+const DDNET: NetworkConfig = NetworkConfig::Ddnet { widths: [4, 4, 4], ends: nets::Ends::Mirrored };
+
+fn trainer(config: &TrainConfig) -> Trainer {
+    Trainer::new(config.clone(), data(config.network.channels())).unwrap()
+}
+
+fn run(trainer: &mut Trainer, steps: usize) -> Vec<StepReport> {
+    (0..steps).map(|_| trainer.step().unwrap()).collect()
+}
+
+fn bits(trainer: &Trainer) -> Vec<u32> {
+    let values = |t: candle_core::Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    trainer.weights().unwrap().into_values().flat_map(values).map(f32::to_bits).collect()
+}
+
+#[test]
+fn resuming_is_the_straight_run_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    for (network, frames) in [(FFDNET, 1), (FASTDVDNET, 3), (DDNET, 3)] {
+        let config = config(network, frames, 6);
+        let mut straight = trainer(&config);
+        let reports = run(&mut straight, 6);
+        let mut first = trainer(&config);
+        run(&mut first, 3);
+        first.save(&path).unwrap();
+        let mut second = trainer(&config);
+        let resumed = second.resume(&path).unwrap();
+        assert!(resumed.refused.is_none() && resumed.from == path);
+        assert_eq!(run(&mut second, 3), reports[3..]);
+        assert!(second.finished());
+        assert_eq!(bits(&second), bits(&straight));
+        assert_eq!(second.validate().unwrap(), straight.validate().unwrap());
+    }
+}
+
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    let config = config(FFDNET, 1, 3);
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut trainer = trainer(&config);
+            run(&mut trainer, 3);
+            bits(&trainer)
+        })
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn a_damaged_checkpoint_is_refused_and_the_one_before_it_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let config = config(FFDNET, 1, 9);
+    let mut first = trainer(&config);
+    run(&mut first, 2);
+    first.save(&path).unwrap();
+    run(&mut first, 2);
+    first.save(&path).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    for part in [0, 1, 8, 15] {
+        std::fs::write(&path, &whole[..whole.len() * part / 16]).unwrap();
+        let mut second = trainer(&config);
+        let resumed = second.resume(&path).unwrap();
+        assert_eq!((second.steps_done(), resumed.from), (2, folder.path().join("run.previous.safetensors")));
+        let refused = resumed.refused.unwrap().to_string();
+        assert!(refused.contains("run.safetensors") && refused.contains("not a whole checkpoint"), "{refused}");
+    }
+    std::fs::remove_file(folder.path().join("run.previous.safetensors")).unwrap();
+    let mut third = trainer(&config);
+    assert!(matches!(third.resume(&path), Err(Error::Format { .. })));
+    assert_eq!(third.steps_done(), 0);
+    // Weights alone are no checkpoint.
+    first.export(&path, nets::weights::Storage::F32).unwrap();
+    assert!(third.resume(&path).unwrap_err().to_string().contains("not written by a training run"));
+}
+
+#[test]
+fn a_checkpoint_of_other_settings_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let config = config(FFDNET, 1, 9);
+    trainer(&config).save(&path).unwrap();
+    let other = TrainConfig { noise: NoiseConfig { sigma: [5.0, 10.0] }, ..config.clone() };
+    let error = trainer(&other).resume(&path).unwrap_err().to_string();
+    assert!(error.contains("noise") && error.contains("50.0"), "{error}");
+    let mut moved = config;
+    moved.data.photos = Some("elsewhere".into());
+    trainer(&moved).resume(&path).unwrap();
+}
+
+/// Training on one still image without noise: the loss falls to a twentieth.
+fn overfit(network: NetworkConfig, frames: usize, steps: usize) {
+    let mut config = config(network, frames, steps as u64);
+    config.data.photo_share = 0.0;
+    config.noise.sigma = [0.0, 0.0];
+    config.training.learning_rate = 1e-2;
+    let wave = |c: usize, y: usize, x: usize| (0.4 * y as f32 + c as f32).sin() + (0.3 * x as f32).cos();
+    let shape = (config.network.channels(), 16, 16);
+    let image = Frame::from_shape_fn(shape, |(c, y, x)| (127.0 + 60.0 * wave(c, y, x)) as u8);
+    let data = TrainData { photos: vec![], videos: vec![vec![image.clone(); 3]], validation: vec![vec![image]] };
+    let mut trainer = Trainer::new(config, data).unwrap();
+    let reports = run(&mut trainer, steps);
+    let last: f32 = reports[steps - 5..].iter().map(|r| r.loss).sum::<f32>() / 5.0;
+    assert!(last < reports[0].loss / 20.0, "{} → {last}", reports[0].loss);
+}
+
+#[test]
+fn ffdnet_learns_one_image() {
+    overfit(FFDNET, 1, 300);
+}
+
+#[test]
+fn fastdvdnet_learns_one_clip() {
+    overfit(FASTDVDNET, 3, 200);
+}
+
+#[test]
+fn ddnet_learns_one_clip() {
+    overfit(NetworkConfig::Ddnet { widths: [8, 8, 8], ends: nets::Ends::Circular }, 3, 400);
+}
+
+#[test]
+fn training_beats_doing_nothing_on_held_out_frames() {
+    let mut config = config(FFDNET, 1, 500);
+    config.training.learning_rate = 1e-2;
+    let mut trainer = trainer(&config);
+    let untrained = trainer.validate().unwrap()[0].psnr_db;
+    run(&mut trainer, 500);
+    let trained = trainer.validate().unwrap()[0].psnr_db;
+    // 20.2 dB is the noise itself.
+    assert!(trained > untrained + 3.0 && trained > 21.0, "{untrained} → {trained}");
+}
+
+#[test]
+fn exported_weights_load_as_the_network() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("weights.safetensors");
+    let trainer = trainer(&config(FASTDVDNET, 3, 1));
+    trainer.export(&path, nets::weights::Storage::F32).unwrap();
+    let read = nets::weights::network(WeightFile::read(&path).unwrap()).unwrap();
+    assert_eq!(read.describe(), trainer.describe());
+}
+
+#[test]
+fn every_setting_has_its_range() {
+    type Change = fn(&mut TrainConfig);
+    let changes: [(&str, Change); 13] = [
+        ("name", |c| c.name = "../x".into()),
+        ("data", |c| (c.data.video, c.data.photos) = (None, None)),
+        ("data.photo_share", |c| c.data.photo_share = f64::NAN),
+        ("data.patch", |c| c.data.patch = 30),
+        ("data.frames", |c| c.data.frames = 0),
+        ("data.batch", |c| c.data.batch = 0),
+        ("noise.sigma", |c| c.noise.sigma = [30.0, 300.0]),
+        ("training.steps", |c| c.training.steps = 0),
+        ("training.learning_rate", |c| c.training.learning_rate = -1.0),
+        ("training.warmup", |c| c.training.warmup = 100),
+        ("training.average", |c| c.training.average = 1.0),
+        ("training.clip_norm", |c| c.training.clip_norm = 0.0),
+        ("validation.sigmas", |c| c.validation.sigmas = vec![-1.0]),
+    ];
+    let good = config(FFDNET, 1, 10);
+    good.validate().unwrap();
+    for (expected, change) in changes {
+        let mut config = good.clone();
+        change(&mut config);
+        match config.validate() {
+            Err(Error::Setting { key, .. }) => assert_eq!(key, expected),
+            other => panic!("{expected}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn unusable_data_is_refused() {
+    let config = config(FFDNET, 1, 1);
+    let refused = |data: TrainData| Trainer::new(config.clone(), data).unwrap_err().to_string();
+    assert!(refused(data(3)).contains("takes 1 channel"));
+    assert!(refused(TrainData { videos: vec![], ..data(1) }).contains("no videos"));
+    assert!(refused(TrainData { photos: vec![], ..data(1) }).contains("no photos"));
+    assert!(refused(TrainData { validation: vec![], ..data(1) }).contains("no validation"));
+    let uneven = vec![vec![photo(1, 0), Frame::zeros((1, 2, 2))]];
+    assert!(refused(TrainData { videos: uneven, ..data(1) }).contains("differ in size"));
+    assert!(frame_from_rgb(&[1, 2, 3], 1, 2, 3).is_err());
+    assert_eq!(frame_from_rgb(&[10, 20, 30], 1, 1, 1).unwrap()[[0, 0, 0]], 18);
+}
+
+#[test]
+fn learning_rates_rise_and_fall() {
+    let config = config(FFDNET, 1, 11);
+    let rates: Vec<f64> = (0..11).map(|s| config.learning_rate(s)).collect();
+    assert_eq!((rates[0], rates[1], rates[2]), (1e-3, 2e-3, 2e-3));
+    assert!(rates[2..].windows(2).all(|w| w[1] < w[0]) && rates[10] < 1e-9);
+}
