@@ -142,7 +142,7 @@ fn every_output_reads_back_as_the_result() {
         );
     }
     let names: Vec<_> = fs::read_dir(bench.path("out")).unwrap().map(|e| e.unwrap().file_name()).collect();
-    for name in ["record.json", "recon.npy", "recon.npz", "recon.mat", "frames", "preview.gif"] {
+    for name in ["record.json", "recon.npy", "recon.npz", "recon.mat", "frames", "preview.gif", "report.html"] {
         assert!(names.iter().any(|n| n == name), "{name} is not in {names:?}");
     }
     let truth = psnr(&bench, "out/recon.npy", "clip.y4m");

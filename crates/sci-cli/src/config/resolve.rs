@@ -281,11 +281,11 @@ impl Experiment {
         }
     }
 
-    /// The denoisers' kinds in the order of the stages, repeated ones once, joined by `+`.
+    /// The denoisers' kinds in the order of the stages, repeated ones once, joined by ` → `.
     pub fn denoiser_kinds(&self) -> String {
         let mut kinds: Vec<&str> = self.stages.iter().map(|s| self.denoisers[s.denoiser].kind()).collect();
         kinds.dedup();
-        kinds.join("+")
+        kinds.join(" → ")
     }
 
     /// The resolved experiment for the run record, with the keys of the TOML; σ in `[0, 1]`, paths absolute.
