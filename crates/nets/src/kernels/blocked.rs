@@ -100,7 +100,8 @@ impl Blocked {
         let view = self.view_mut();
         // SAFETY: `planes` has C·H·W floats; the interior of this image is as large; detect() gives what there is.
         unsafe {
-            pack(isa, planes.as_ptr(), height * width, width, channels, height, width, view.inner());
+            let planes = Planes { ptr: planes.as_ptr(), plane: height * width, channels, height, width };
+            pack(isa, planes, view.inner());
         }
         Ok(())
     }
@@ -114,16 +115,14 @@ impl Blocked {
         let isa = Isa::detect()?;
         // SAFETY: as in `read_planes`.
         unsafe {
-            unpack(
-                isa,
-                self.view().inner(),
-                self.channels,
-                self.height,
-                self.width,
-                planes.as_mut_ptr(),
-                self.height * self.width,
-                self.width,
-            );
+            let planes = Planes {
+                ptr: planes.as_mut_ptr(),
+                plane: self.height * self.width,
+                channels: self.channels,
+                height: self.height,
+                width: self.width,
+            };
+            unpack(isa, self.view().inner(), planes);
         }
         Ok(())
     }
@@ -157,6 +156,16 @@ pub(super) fn floats(pixels: &[Pixel]) -> &[f32] {
 pub(super) fn floats_mut(pixels: &mut [Pixel]) -> &mut [f32] {
     // SAFETY: a Pixel is 16 floats without padding, and any floats make a Pixel.
     unsafe { std::slice::from_raw_parts_mut(pixels.as_mut_ptr().cast(), pixels.len() * LANES) }
+}
+
+/// Rows of `channels` planes that lie `plane` floats apart, by a pointer to read or to write.
+#[derive(Clone, Copy)]
+pub(super) struct Planes<P> {
+    pub(super) ptr: P,
+    pub(super) plane: usize,
+    pub(super) channels: usize,
+    pub(super) height: usize,
+    pub(super) width: usize,
 }
 
 /// Blocked pixels to read: block `b`, row `y`, column `x` at `ptr + b·block + y·row + 16·x`.
@@ -210,21 +219,12 @@ impl ViewMut {
     }
 }
 
-entry!(pub(super) fn pack = pack_rows(
-    planes: *const f32, plane: usize, line: usize, channels: usize, height: usize, width: usize, dst: ViewMut,
-));
+entry!(pub(super) fn pack = pack_rows(planes: Planes<*const f32>, dst: ViewMut));
 
-/// Planes, `plane` floats apart with lines `line` apart, to blocks.
+/// Planes to blocks.
 #[inline(always)]
-unsafe fn pack_rows<S: Simd>(
-    planes: *const f32,
-    plane: usize,
-    line: usize,
-    channels: usize,
-    height: usize,
-    width: usize,
-    dst: ViewMut,
-) {
+unsafe fn pack_rows<S: Simd>(planes: Planes<*const f32>, dst: ViewMut) {
+    let Planes { ptr, plane, channels, height, width } = planes;
     let mut c = 0;
     while c < channels {
         let lanes = (channels - c).min(LANES);
@@ -235,7 +235,7 @@ unsafe fn pack_rows<S: Simd>(
                 let pixels = (width - x).min(LANES);
                 // SAFETY: pixels x..x+pixels of row y, channels c..c+lanes are inside on both sides.
                 unsafe {
-                    let src = planes.add(c * plane + y * line + x);
+                    let src = ptr.add(c * plane + y * width + x);
                     let out = dst.ptr.add(c / LANES * dst.block + y * dst.row + x * LANES);
                     if lanes == LANES && pixels == LANES {
                         S::transpose(src, plane, out, LANES);
@@ -265,21 +265,12 @@ unsafe fn pack_rows<S: Simd>(
     }
 }
 
-entry!(pub(super) fn unpack = unpack_rows(
-    src: View, channels: usize, height: usize, width: usize, planes: *mut f32, plane: usize, line: usize,
-));
+entry!(pub(super) fn unpack = unpack_rows(src: View, planes: Planes<*mut f32>));
 
-/// Blocks to planes, `plane` floats apart with lines `line` apart.
+/// Blocks to planes.
 #[inline(always)]
-unsafe fn unpack_rows<S: Simd>(
-    src: View,
-    channels: usize,
-    height: usize,
-    width: usize,
-    planes: *mut f32,
-    plane: usize,
-    line: usize,
-) {
+unsafe fn unpack_rows<S: Simd>(src: View, planes: Planes<*mut f32>) {
+    let Planes { ptr, plane, channels, height, width } = planes;
     let mut c = 0;
     while c < channels {
         let lanes = (channels - c).min(LANES);
@@ -291,7 +282,7 @@ unsafe fn unpack_rows<S: Simd>(
                 // SAFETY: pixels x..x+pixels of row y, channels c..c+lanes are inside on both sides.
                 unsafe {
                     let p = src.ptr.add(c / LANES * src.block + y * src.row + x * LANES);
-                    let out = planes.add(c * plane + y * line + x);
+                    let out = ptr.add(c * plane + y * width + x);
                     if lanes == LANES && pixels == LANES {
                         S::transpose(p, LANES, out, plane);
                         let mut k = 0;

@@ -1,7 +1,7 @@
 //! A convolution ready to run: its algorithm chosen, its filters packed.
 
-use super::blocked::{Blocked, Pixel, ViewMut, ZERO, padded, unpack};
-use super::scratch::{Planes, Scratch, Slot, band};
+use super::blocked::{Blocked, Pixel, Planes, ViewMut, ZERO, padded, unpack};
+use super::scratch::{Scratch, Slot, band};
 use super::simd::{Isa, LANES};
 use super::{KernelError, Step, Strip, Weights, direct, winograd};
 
@@ -114,7 +114,7 @@ impl PackedConv {
         let (out_h, out_w) = (self.step.out_size(height), self.step.out_size(width));
         output.resize(self.outputs, out_h, out_w);
         let (src, dst) = (input.view(), output.view_mut().inner());
-        let each = self.strip_rows(out_w);
+        let each = strip_rows(out_w);
         scratch.each(out_h.div_ceil(each), |i, slot| {
             let y = i * each;
             let strip = Strip {
@@ -154,13 +154,19 @@ impl PackedConv {
         let [n, channels, height, width] = shape;
         self.check(channels, shape)?;
         super::blocked::check_len(n * channels * height * width, input.len())?;
-        let each = self.strip_rows(out_w);
+        let each = strip_rows(out_w);
         let strips = out_h.div_ceil(each);
         let output = SendPtr(output);
         scratch.each(n * strips, |job, slot| {
             let (image, y) = (job / strips, job % strips * each);
             let rows = each.min(out_h - y);
-            let planes = Planes { ptr: input[image * channels * height * width..].as_ptr(), channels, height, width };
+            let planes = Planes {
+                ptr: input[image * channels * height * width..].as_ptr(),
+                plane: height * width,
+                channels,
+                height,
+                width,
+            };
             // SAFETY: `planes` is image `image` of the checked input; the strip's output rows are its own.
             unsafe {
                 let first = self.step.first_row(y);
@@ -171,16 +177,17 @@ impl PackedConv {
                 let dst = ViewMut { ptr: slot.dst.as_mut_ptr(), block: rows * out_w * LANES, row: out_w * LANES };
                 self.strip(Strip { src, dst, rows, width: out_w }, slot);
                 let plane = out_h * out_w;
-                let out = output.at((image * self.outputs) * plane + y * out_w);
-                unpack(self.isa, dst.shared(), self.outputs, rows, out_w, out, plane, out_w);
+                let result = Planes {
+                    ptr: output.at(image * self.outputs * plane + y * out_w),
+                    plane,
+                    channels: self.outputs,
+                    height: rows,
+                    width: out_w,
+                };
+                unpack(self.isa, dst.shared(), result);
             }
         });
         Ok(())
-    }
-
-    /// Output rows worked on at once: whole tiles, enough of them to keep the products wide, few enough for the cache.
-    fn strip_rows(&self, width: usize) -> usize {
-        strip_rows(width)
     }
 
     /// # Safety
@@ -200,7 +207,7 @@ impl PackedConv {
     }
 }
 
-/// See [`PackedConv::strip_rows`].
+/// Output rows worked on at once: whole tiles, enough of them to keep the products wide, few enough for the cache.
 pub(super) fn strip_rows(width: usize) -> usize {
     const TILES: usize = 64;
     winograd::TILE * (TILES / width.div_ceil(winograd::TILE)).max(1)

@@ -4,16 +4,14 @@ use super::blocked::{Pixel, ZERO};
 use super::scratch::Slot;
 use super::simd::{LANES, Simd, entry};
 use super::tile::{Out, Run, outer, product};
-use super::{GradStrip, Panel, Step, Strip, Weights};
+use super::{ChannelRun, GradStrip, Panel, Step, Strip, Weights};
 
-/// Channels `lane..lane + len` of an input block, one row and column of the filter away.
+/// Input channels, one row and column of the filter away.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
     row: usize,
     column: usize,
-    block: usize,
-    lane: usize,
-    len: usize,
+    run: ChannelRun,
 }
 
 /// One panel of output channels at the output pixels of one parity.
@@ -62,11 +60,11 @@ impl Direct {
     fn push(&mut self, weights: &Weights<'_>, panel: Panel, parity: (usize, usize)) {
         let first = self.filters.len();
         let mut taps = Vec::new();
-        for (block, lane, len) in panel.input_runs(weights) {
+        for run in panel.input_runs(weights) {
             for &(ky, row) in taps_1d(self.step, parity.0) {
                 for &(kx, column) in taps_1d(self.step, parity.1) {
-                    taps.push(Tap { row, column, block, lane, len });
-                    for c in block * LANES + lane..block * LANES + lane + len {
+                    taps.push(Tap { row, column, run });
+                    for c in run.channels() {
                         for v in 0..panel.vecs {
                             let mut w = ZERO;
                             let o = (panel.block + v) * LANES;
@@ -114,8 +112,8 @@ unsafe fn forward_by<S: Simd, const STEP: usize>(
         slot.runs.clear();
         for tap in taps {
             slot.runs.push(Run {
-                offset: tap.block * strip.src.block + tap.row * strip.src.row + tap.column * LANES + tap.lane,
-                len: tap.len,
+                offset: tap.run.block * strip.src.block + tap.row * strip.src.row + tap.column * LANES + tap.run.lane,
+                len: tap.run.len,
             });
         }
         let count = strip.width.saturating_sub(px).div_ceil(out_step);
@@ -148,7 +146,7 @@ unsafe fn forward_by<S: Simd, const STEP: usize>(
 /// Sums of the weight gradient: for each panel, `[run][9][channels of the run][vecs · 16]`.
 #[derive(Debug)]
 pub(super) struct GradPlan {
-    parts: Vec<(Panel, Vec<(usize, usize, usize)>)>,
+    parts: Vec<(Panel, Vec<ChannelRun>)>,
     step: Step,
     pub(super) pixels: usize,
 }
@@ -160,7 +158,7 @@ impl GradPlan {
             .into_iter()
             .map(|panel| (panel, panel.input_runs(weights).collect()))
             .collect();
-        let pixels = parts.iter().map(|(panel, runs)| 9 * panel.vecs * runs.iter().map(|r| r.2).sum::<usize>()).sum();
+        let pixels = parts.iter().map(|(panel, runs)| 9 * panel.vecs * runs.iter().map(|r| r.len).sum::<usize>()).sum();
         Self { parts, step, pixels }
     }
 
@@ -168,9 +166,9 @@ impl GradPlan {
     pub(super) fn finish(&self, shape: &Weights<'_>, sums: &[Pixel], grad: &mut [f32]) {
         let mut sums = sums.iter();
         for (panel, runs) in &self.parts {
-            for &(block, lane, len) in runs {
+            for run in runs {
                 for tap in 0..9 {
-                    for c in block * LANES + lane..block * LANES + lane + len {
+                    for c in run.channels() {
                         for v in 0..panel.vecs {
                             let sum = sums.next().expect("the plan counted its own sums");
                             let o = (panel.block + v) * LANES;
@@ -206,7 +204,7 @@ unsafe fn weight_grad_by<S: Simd, const STEP: usize>(plan: &GradPlan, sums: &mut
     let mut acc = sums.as_mut_ptr().cast::<f32>();
     let (input, grad) = (strip.input, strip.grad);
     for (panel, runs) in &plan.parts {
-        for &(block, lane, len) in runs {
+        for &ChannelRun { block, lane, len } in runs {
             for tap in 0..9 {
                 let mut y = 0;
                 while y < strip.rows {

@@ -3,9 +3,9 @@
 //! The batch is cut into chunks of strips, as many as the shape alone says; each chunk is summed by one worker in order,
 //! and the chunks' sums are added in order, so that the result does not depend on the number of threads.
 
-use super::blocked::{Pixel, ZERO, padded};
+use super::blocked::{Pixel, Planes, ZERO, padded};
 use super::conv::{prefers_winograd, strip_rows};
-use super::scratch::{Planes, Scratch, Slot, band};
+use super::scratch::{Scratch, Slot, band};
 use super::simd::{Isa, LANES};
 use super::{GradStrip, KernelError, Step, Weights, direct, winograd};
 use std::sync::Mutex;
@@ -18,18 +18,25 @@ enum Plan {
     Direct(direct::GradPlan),
 }
 
+/// What the gradient is taken of.
+pub(super) struct Operands<'a> {
+    /// `[N,Cin,H,W]`.
+    pub(super) input: &'a [f32],
+    pub(super) shape: [usize; 4],
+    /// `∂y [N,Cout,..]`.
+    pub(super) grad: &'a [f32],
+    pub(super) outputs: usize,
+}
+
 /// `∂w[o,i] = Σ_n ∂y[n,o] ⋆ x[n,i]` as `[Cout, Cin/groups, 3, 3]`, and `∂b[o] = Σ ∂y[n,o]`.
 pub(super) fn weight_grad(
     isa: Isa,
-    input: &[f32],
-    shape: [usize; 4],
-    grad: &[f32],
-    outputs: usize,
+    operands: &Operands<'_>,
     step: Step,
     groups: usize,
     scratch: &mut Scratch,
 ) -> Result<(Vec<f32>, Vec<f32>), KernelError> {
-    let [n, inputs, height, width] = shape;
+    let Operands { input, shape: [n, inputs, height, width], grad, outputs } = *operands;
     let (out_h, out_w) = (step.out_size(height), step.out_size(width));
     super::blocked::check_len(n * inputs * height * width, input.len())?;
     super::blocked::check_len(n * outputs * out_h * out_w, grad.len())?;
@@ -59,9 +66,16 @@ pub(super) fn weight_grad(
         for job in chunk * n * strips / chunks..(chunk + 1) * n * strips / chunks {
             let (image, y) = (job / strips, job % strips * each);
             let rows = each.min(out_h - y);
-            let x = Planes { ptr: input[image * inputs * height * width..].as_ptr(), channels: inputs, height, width };
+            let x = Planes {
+                ptr: input[image * inputs * height * width..].as_ptr(),
+                plane: height * width,
+                channels: inputs,
+                height,
+                width,
+            };
             let g = Planes {
                 ptr: grad[image * outputs * out_h * out_w..].as_ptr(),
+                plane: out_h * out_w,
                 channels: outputs,
                 height: out_h,
                 width: out_w,

@@ -1,7 +1,7 @@
 //! The kernels as differentiable candle operations.
 
 use super::conv::PackedConv;
-use super::grad::weight_grad;
+use super::grad::{Operands, weight_grad};
 use super::scratch::Scratch;
 use super::simd::Isa;
 use super::{KernelError, Step, Weights};
@@ -186,7 +186,8 @@ impl Op {
         let (dw, db) = with_numbers(x, |x| {
             with_numbers(grad, |g| {
                 Scratch::lend(|scratch| {
-                    weight_grad(self.isa, x, [n, channels, height, width], g, outputs, step, self.opts.groups, scratch)
+                    let operands = Operands { input: x, shape: [n, channels, height, width], grad: g, outputs };
+                    weight_grad(self.isa, &operands, step, self.opts.groups, scratch)
                 })
                 .map_err(Error::wrap)
             })

@@ -1,6 +1,6 @@
 //! Memory that calls reuse, and how work is shared out.
 
-use super::blocked::{Pixel, View, ZERO};
+use super::blocked::{Pixel, Planes, View, ViewMut, ZERO, pack};
 use super::simd::{Isa, LANES};
 use super::tile::Run;
 use rayon::prelude::*;
@@ -87,22 +87,13 @@ impl Scratch {
     }
 }
 
-/// One image of `[C,H,W]` planes.
-#[derive(Clone, Copy)]
-pub(super) struct Planes {
-    pub(super) ptr: *const f32,
-    pub(super) channels: usize,
-    pub(super) height: usize,
-    pub(super) width: usize,
-}
-
 /// Copies rows `first - top..` of an image to blocks with a border of zeros: `rows` rows in all, `padded_width` wide.
 ///
 /// # Safety
 /// The image must be readable and `isa` available.
 pub(super) unsafe fn band(
     isa: Isa,
-    image: Planes,
+    image: Planes<*const f32>,
     top: usize,
     first: usize,
     rows: usize,
@@ -128,16 +119,12 @@ pub(super) unsafe fn band(
     let ptr = buffer.as_mut_ptr();
     // SAFETY: rows from..to lie in the image and in the band.
     unsafe {
-        super::blocked::pack(
-            isa,
-            image.ptr.wrapping_add((first + from).wrapping_sub(top).wrapping_mul(image.width)),
-            image.height * image.width,
-            image.width,
-            image.channels,
-            to - from,
-            image.width,
-            super::blocked::ViewMut { ptr: ptr.add(from * line + LANES), block, row: line },
-        );
+        let rows = Planes {
+            ptr: image.ptr.wrapping_add((first + from).wrapping_sub(top).wrapping_mul(image.width)),
+            height: to - from,
+            ..image
+        };
+        pack(isa, rows, ViewMut { ptr: ptr.add(from * line + LANES), block, row: line });
     }
     View { ptr, block, row: line }
 }

@@ -484,20 +484,20 @@ impl GradPlan {
 /// `Gᵀ u G` of 16 output channels, as `[9][16]`.
 fn transform_back<'a>(u: impl Fn(usize) -> &'a [f32; LANES]) -> [[f64; LANES]; 9] {
     let mut g = [[0.0; LANES]; 9];
-    for i in 0..SIDE {
+    for (i, row) in G.iter().enumerate() {
         let mut t = [[0.0; LANES]; 3];
-        for j in 0..SIDE {
+        for (j, column) in G.iter().enumerate() {
             let u = u(i * SIDE + j);
             for x in 0..3 {
                 for k in 0..LANES {
-                    t[x][k] += G[j][x] * f64::from(u[k]);
+                    t[x][k] += column[x] * f64::from(u[k]);
                 }
             }
         }
         for y in 0..3 {
             for x in 0..3 {
                 for k in 0..LANES {
-                    g[y * 3 + x][k] += G[i][y] * t[x][k];
+                    g[y * 3 + x][k] += row[y] * t[x][k];
                 }
             }
         }
