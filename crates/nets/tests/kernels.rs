@@ -510,6 +510,25 @@ fn broken_rules_are_named() -> Result<()> {
     Ok(())
 }
 
+/// The choice is read once per process, so this runs another test in processes of its own.
+#[test]
+fn environment_chooses_the_instruction_set() -> std::io::Result<()> {
+    let run = |name: &str| {
+        std::process::Command::new(std::env::current_exe()?)
+            .args(["--exact", "only_what_is_asked_for_gets_a_gradient"])
+            .env("SCI_KERNEL", name)
+            .output()
+    };
+    for isa in Isa::ALL {
+        assert_eq!(run(isa.name())?.status.success(), isa.available(), "{isa:?}");
+    }
+    let refused = run("mmx")?;
+    assert!(!refused.status.success());
+    let said = String::from_utf8_lossy(&refused.stdout).into_owned();
+    assert!(said.contains("avx512, avx2, neon or portable"), "{said}");
+    Ok(())
+}
+
 proptest::proptest! {
     #![proptest_config(proptest::prelude::ProptestConfig { cases: 48, failure_persistence: None, ..Default::default() })]
 
