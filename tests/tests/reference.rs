@@ -81,3 +81,15 @@ fn divergence_is_a_failure_with_a_result() {
     assert_eq!(m["stop"], "diverged");
     assert!(m["relative_residual"].is_number() && bench.path("out/recon.npy").is_file());
 }
+
+/// A network for the wrong number of channels is found out before anything is solved.
+#[test]
+fn color_weights_on_a_gray_scene() {
+    let Some(root) = data_root() else { return };
+    let bench = Bench::new();
+    let mut command = bench.command(&["run", "--out", "out", "--set", "denoiser.weights=ffdnet_color.pth"]);
+    let run = bench.finish(command.arg(workspace().join("configs/gray/gap-ffdnet.toml")).env("SCI_DATA", root));
+    assert_eq!(run.code, 1);
+    assert!(run.stderr.contains("denoiser.weights") && run.stderr.contains("3 channels"), "{}", run.stderr);
+    assert!(bench.names().is_empty());
+}

@@ -115,9 +115,16 @@ fn load(choice: &DenoiserChoice) -> anyhow::Result<Part> {
         DenoiserChoice::Tv { weight, inner, warm_dual } => {
             Part::Tv { weight: *weight, inner: *inner, warm_dual: *warm_dual }
         }
-        DenoiserChoice::Ffdnet { weights } => Part::Ffdnet(
-            nets::Ffdnet::load(weights).with_context(|| format!("denoiser.weights: {}", weights.display()))?,
-        ),
+        DenoiserChoice::Ffdnet { weights } => {
+            let net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
+            let channels = net.spec().channels;
+            anyhow::ensure!(
+                channels == 1,
+                "denoiser.weights: {}: a network for {channels} channels, but the scene is gray: it needs one for 1",
+                weights.display()
+            );
+            Part::Ffdnet(net)
+        }
     })
 }
 
