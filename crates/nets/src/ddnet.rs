@@ -120,14 +120,14 @@ pub(crate) fn sparse_rgb(cfa: CfaPattern, mosaic: ArrayView3<'_, f32>) -> Array4
     Array4::from_shape_fn((t, 3, h + top, w + left), |(t, color, y, x)| {
         let (row, column) = (reflect(y as isize - top as isize, h), reflect(x as isize - left as isize, w));
         // In an image one pixel wide the mirrored column has the wrong color: it stays unknown.
-        let seen = CfaPattern::Rggb.color_at(y, x) == color && cfa.color_at(row, column) == color;
+        let seen = CfaPattern::Rggb.color_at(y, x) as usize == color && cfa.color_at(row, column) as usize == color;
         if seen { mosaic[[t, row, column]] } else { 0.0 }
     })
 }
 
 /// Rows and columns to put before a mosaic to make it RGGB.
 fn shift(cfa: CfaPattern) -> (usize, usize) {
-    let red = |row, column| cfa.color_at(row, column) == 0;
+    let red = |row, column| cfa.color_at(row, column) as usize == 0;
     match (red(0, 0), red(0, 1), red(1, 0)) {
         (true, ..) => (0, 0),
         (_, true, _) => (0, 1),
@@ -196,9 +196,9 @@ mod tests {
         for cfa in [CfaPattern::Rggb, CfaPattern::Bggr, CfaPattern::Grbg, CfaPattern::Gbrg] {
             for (h, w) in [(4, 6), (5, 3), (2, 2)] {
                 // Each pixel holds its color plus one.
-                let mosaic = Array3::from_shape_fn((1, h, w), |(_, y, x)| cfa.color_at(y, x) as f32 + 1.0);
+                let mosaic = Array3::from_shape_fn((1, h, w), |(_, y, x)| cfa.color_at(y, x) as u8 as f32 + 1.0);
                 for ((_, color, y, x), &v) in sparse_rgb(cfa, mosaic.view()).indexed_iter() {
-                    let seen = CfaPattern::Rggb.color_at(y, x) == color;
+                    let seen = CfaPattern::Rggb.color_at(y, x) as usize == color;
                     assert_eq!(v, if seen { color as f32 + 1.0 } else { 0.0 }, "{cfa:?} {h}×{w} at {y}, {x}");
                 }
             }

@@ -1,40 +1,28 @@
-//! Bayer color filter arrays: which color a sensor pixel sees, and the seam that demosaicers implement.
+//! Bayer sensors: which color a pixel sees, the mosaic operator T and its adjoint, the four sub-lattices, and demosaicing.
+//!
+//! | Demosaicer | Method | Border |
+//! |---|---|---|
+//! | [`Bilinear`] | mean of the 2 or 4 nearest samples | mirrored, the edge not repeated |
+//! | [`Malvar`] | gradient-corrected linear 5×5 filters | mirrored, the edge not repeated |
+//! | [`Menon`] | directional filtering, a posteriori decision, refinement | mirrored, the edge not repeated |
+//!
+//! Mirroring without repeating the edge keeps the color of every site: a red row is mirrored into red rows.
+
+mod bilinear;
+mod malvar;
+mod menon;
+mod mosaic;
+mod pattern;
+mod rows;
+
+pub use bilinear::Bilinear;
+pub use malvar::Malvar;
+pub use menon::Menon;
+pub use mosaic::{mosaic_adjoint_into, mosaic_into, sub_lattice, sub_lattice_mut};
+pub use pattern::{CfaPattern, Color};
 
 use crate::BoxError;
 use ndarray::{ArrayView3, ArrayViewMut4};
-
-/// The color filter array of the sensor, named by its top-left 2×2 block in reading order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum CfaPattern {
-    /// Red top left, blue bottom right.
-    #[default]
-    Rggb,
-    /// Blue top left, red bottom right.
-    Bggr,
-    /// Red top right, blue bottom left.
-    Grbg,
-    /// Red bottom left, blue top right.
-    Gbrg,
-}
-
-impl CfaPattern {
-    /// The color seen by the pixel at `(row, column)`: 0 red, 1 green, 2 blue.
-    ///
-    /// ```
-    /// use sci_forward::CfaPattern;
-    /// assert_eq!([(0, 0), (0, 1), (1, 0), (3, 1)].map(|(r, c)| CfaPattern::Rggb.color_at(r, c)), [0, 1, 1, 2]);
-    /// ```
-    pub fn color_at(self, row: usize, column: usize) -> usize {
-        let (red_row, red_column) = match self {
-            Self::Rggb => (0, 0),
-            Self::Bggr => (1, 1),
-            Self::Grbg => (0, 1),
-            Self::Gbrg => (1, 0),
-        };
-        // 0 on the red site, 1 on either green, 2 on blue.
-        ((row ^ red_row) & 1) + ((column ^ red_column) & 1)
-    }
-}
 
 /// Fills in the two colors that each pixel of a mosaic video did not see.
 pub trait Demosaicer {
@@ -48,4 +36,47 @@ pub trait Demosaicer {
         mosaic: ArrayView3<'_, f32>,
         rgb: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError>;
+}
+
+impl<M: Demosaicer + ?Sized> Demosaicer for &mut M {
+    fn demosaic(
+        &mut self,
+        cfa: CfaPattern,
+        mosaic: ArrayView3<'_, f32>,
+        rgb: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        (**self).demosaic(cfa, mosaic, rgb)
+    }
+}
+
+impl<M: Demosaicer + ?Sized> Demosaicer for Box<M> {
+    fn demosaic(
+        &mut self,
+        cfa: CfaPattern,
+        mosaic: ArrayView3<'_, f32>,
+        rgb: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        (**self).demosaic(cfa, mosaic, rgb)
+    }
+}
+
+/// A mosaic that is too small to have every color.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a mosaic of {height}×{width} pixels cannot be demosaicked: at least 2×2 are needed")]
+pub struct MosaicTooSmall {
+    /// H.
+    pub height: usize,
+    /// W.
+    pub width: usize,
+}
+
+/// Checks the sizes of a demosaicing call.
+///
+/// # Panics
+/// If `rgb` is not the mosaic's `[T, 3, H, W]`.
+#[track_caller]
+fn check_sizes(mosaic: &ArrayView3<'_, f32>, rgb: &ArrayViewMut4<'_, f32>) -> Result<(), MosaicTooSmall> {
+    let (frames, height, width) = mosaic.dim();
+    assert_eq!(rgb.dim(), (frames, 3, height, width), "the RGB video must have the mosaic's size");
+    if height < 2 || width < 2 { Err(MosaicTooSmall { height, width }) } else { Ok(()) }
 }

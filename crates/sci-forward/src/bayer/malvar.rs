@@ -1,0 +1,107 @@
+//! Gradient-corrected linear interpolation.
+
+use super::rows::{PAD, Window};
+use super::{CfaPattern, Color, Demosaicer, check_sizes};
+use crate::BoxError;
+use multiversion::multiversion;
+use ndarray::parallel::prelude::*;
+use ndarray::{ArrayView2, ArrayView3, ArrayViewMut3, ArrayViewMut4, Axis, s};
+
+/// Rows of one parallel task.
+const BAND: usize = 32;
+
+/// Linear demosaicing with 5×5 filters that correct the bilinear estimate by the gradient of the color that was seen.
+///
+/// With `m` the sample, `h1`, `v1` the sums of the two neighbours at distance 1 along the row and the column, `h2`, `v2` those
+/// at distance 2, and `d` the sum of the four diagonal neighbours, all divided by 8:
+///
+/// ```text
+/// green at red or blue               4 m + 2 (h1 + v1) − (h2 + v2)
+/// red at green in a red row          5 m + 4 h1 − d − h2 + ½ v2        (blue at green in a blue row)
+/// red at green in a blue row         5 m + 4 v1 − d − v2 + ½ h2        (blue at green in a red row)
+/// red at blue, blue at red           6 m + 2 d − 3/2 (h2 + v2)
+/// ```
+///
+/// # References
+/// Malvar, He, Cutler, *High-quality linear interpolation for demosaicing of Bayer-patterned color images*, 2004.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Malvar;
+
+impl Demosaicer for Malvar {
+    fn demosaic(
+        &mut self,
+        cfa: CfaPattern,
+        mosaic: ArrayView3<'_, f32>,
+        mut rgb: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        check_sizes(&mosaic, &rgb)?;
+        rgb.axis_iter_mut(Axis(0)).into_par_iter().zip(mosaic.axis_iter(Axis(0))).for_each(|(mut rgb, mosaic)| {
+            rgb.axis_chunks_iter_mut(Axis(1), BAND)
+                .into_par_iter()
+                .enumerate()
+                .for_each(|(band, rgb)| demosaic_band(cfa, mosaic, band * BAND, rgb));
+        });
+        Ok(())
+    }
+}
+
+/// Rows `first..` of a frame, `rgb` being `[3, rows, W]`.
+fn demosaic_band(cfa: CfaPattern, mosaic: ArrayView2<'_, f32>, first: usize, mut rgb: ArrayViewMut3<'_, f32>) {
+    let width = mosaic.ncols();
+    let mut window = Window::around(mosaic, first);
+    let mut filtered = [const { Vec::new() }; 4].map(|_: Vec<f32>| vec![0.0; width]);
+    for r in 0..rgb.dim().1 {
+        if r > 0 {
+            window.advance(mosaic, first + r);
+        }
+        filter_row(window.rows(), &mut filtered);
+        let sample = &window.rows()[PAD][PAD..PAD + width];
+        let [green, along, across, opposite] = &filtered;
+        // What a site does not see: at a colored site green and the opposite color; at a green one the color of its row along
+        // the row, the other one across.
+        for (column, color) in [0, 1].map(|c| (c, cfa.color_at(first + r, c))) {
+            let row_color = if color == Color::Green { cfa.color_at(first + r, column + 1) } else { color };
+            let other = if row_color == Color::Red { Color::Blue } else { Color::Red };
+            let sources = match color {
+                Color::Green => [(Color::Green, sample), (row_color, &along[..]), (other, &across[..])],
+                _ => [(color, sample), (Color::Green, &green[..]), (other, &opposite[..])],
+            };
+            for (channel, source) in sources {
+                let mut row = rgb.slice_mut(s![channel as usize, r, ..]);
+                match row.as_slice_mut() {
+                    Some(row) => copy_every_other(row, source, column),
+                    None => (column..width).step_by(2).for_each(|c| row[c] = source[c]),
+                }
+            }
+        }
+    }
+}
+
+fn copy_every_other(to: &mut [f32], from: &[f32], first: usize) {
+    for (to, from) in to[first..].iter_mut().step_by(2).zip(from[first..].iter().step_by(2)) {
+        *to = *from;
+    }
+}
+
+/// The four filters `[green, along the row, across it, opposite]` at every pixel of the middle row.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn filter_row(rows: [&[f32]; 5], filtered: &mut [Vec<f32>; 4]) {
+    let [up2, up1, here, down1, down2] = rows;
+    let width = here.len() - 2 * PAD;
+    let [green, along, across, opposite] = filtered;
+    let (green, along) = (&mut green[..width], &mut along[..width]);
+    let (across, opposite) = (&mut across[..width], &mut opposite[..width]);
+    let (left2, left1, m) = (&here[..width], &here[1..][..width], &here[2..][..width]);
+    let (right1, right2) = (&here[3..][..width], &here[4..][..width]);
+    let (up_left, up, up_right) = (&up1[1..][..width], &up1[2..][..width], &up1[3..][..width]);
+    let (down_left, down, down_right) = (&down1[1..][..width], &down1[2..][..width], &down1[3..][..width]);
+    let (up2, down2) = (&up2[2..][..width], &down2[2..][..width]);
+    for x in 0..width {
+        let (h1, v1, h2, v2) = (left1[x] + right1[x], up[x] + down[x], left2[x] + right2[x], up2[x] + down2[x]);
+        let d = (up_left[x] + up_right[x]) + (down_left[x] + down_right[x]);
+        green[x] = 0.125 * (4.0 * m[x] + 2.0 * (h1 + v1) - (h2 + v2));
+        along[x] = 0.125 * (5.0 * m[x] + 4.0 * h1 - d - h2 + 0.5 * v2);
+        across[x] = 0.125 * (5.0 * m[x] + 4.0 * v1 - d - v2 + 0.5 * h2);
+        opposite[x] = 0.125 * (6.0 * m[x] + 2.0 * d - 1.5 * (h2 + v2));
+    }
+}
