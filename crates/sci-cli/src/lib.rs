@@ -9,4 +9,5 @@ pub mod factory;
 pub mod io;
 pub mod progress;
 pub mod record;
+pub mod report;
 pub mod simulate;

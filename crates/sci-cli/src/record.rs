@@ -216,11 +216,11 @@ pub mod host {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// The example of the format's description, with every name a reader may rely on.
-    const EXAMPLE: &str = r#"
+    pub(crate) const EXAMPLE: &str = r#"
 { "schema": 1, "experiment": "gray/gap-tv", "scene": "traffic48.mat", "solver": "gap", "denoiser": "tv",
   "measurements": [ { "index": 0, "psnr_db": 20.76, "ssim": 0.687, "ssim_gaussian": 0.70, "psnr_rgb_db": null, "seconds": 0.05, "iterations": 40,
       "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },

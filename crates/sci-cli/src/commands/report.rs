@@ -1,9 +1,10 @@
-//! `sci report`: a table of finished runs.
+//! `sci report`: finished runs side by side, as a table and as a page.
 
 use std::path::PathBuf;
 
 use super::Done;
 use crate::record::Record;
+use crate::report;
 
 /// Arguments of `sci report`.
 #[derive(Debug, clap::Args)]
@@ -11,6 +12,9 @@ pub(super) struct Args {
     /// Folders that `sci run` wrote
     #[arg(required = true, value_name = "DIR")]
     runs: Vec<PathBuf>,
+    /// Also write a page with the table and the convergence curves
+    #[arg(long, value_name = "FILE.html")]
+    out: Option<PathBuf>,
 }
 
 impl Args {
@@ -31,6 +35,10 @@ impl Args {
                 r.mean.seconds,
                 r.mean.iterations
             );
+        }
+        if let Some(page) = self.out {
+            report::write_comparison(&page, &records)?;
+            outln!("wrote {}", page.display());
         }
         Ok(Done::Complete)
     }

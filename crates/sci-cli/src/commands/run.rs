@@ -17,7 +17,7 @@ use crate::io::output::{ArrayFormat, Part, Staging, write_arrays, write_frames, 
 use crate::io::scene::{self, Scene};
 use crate::progress::Progress;
 use crate::record::{MeanRecord, MeasurementRecord, Record, SCHEMA, Skipped, Trace, host};
-// use crate::report;
+use crate::report::{self, MeasurementImages};
 use crate::simulate::{NoiseModel, simulate};
 
 /// Arguments of `sci run`.
@@ -25,7 +25,8 @@ use crate::simulate::{NoiseModel, simulate};
 pub(super) struct Args {
     /// The experiment file, TOML
     config: PathBuf,
-    /// Override a key of the file, for example --set stage.0.sigma=25 or --set data.path=traffic48.mat
+    /// Override a key of the file: --set stage.0.sigma=25, --set data.path=traffic48.mat (a path given so is looked up
+    /// in the current folder, then in SCI_DATA)
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Where to write [default: runs/<name>]
@@ -243,7 +244,7 @@ fn finish(experiment: &Experiment, scene: &Scene, solutions: &[Solution], out: &
         outln!("mean             PSNR {p:6.2} dB   SSIM {s:.4}   {:.2} s", record.mean.seconds);
     }
     write(experiment, scene, solutions, &record, out)?;
-    outln!("wrote {}", out.display());
+    outln!("wrote {}; look at {}", out.display(), out.join("report.html").display());
     let diverged = record.measurements.iter().filter(|m| m.stop == crate::record::Stop::Diverged).count();
     anyhow::ensure!(
         diverged == 0,
@@ -301,7 +302,15 @@ fn write(
     if output.preview {
         write_preview(&dir.join("preview.gif"), video.view(), output.fps)?;
     }
-    // report::write(&dir.join("report.html"), record, scene, &views).context("report.html")?;
+    let images: Vec<MeasurementImages<'_>> = solutions
+        .iter()
+        .map(|s| MeasurementImages {
+            measurement: scene.measurement(s.record.index),
+            recon: s.estimate.view().insert_axis(Axis(1)),
+            truth: scene.truth_of(s.record.index).map(|t| t.insert_axis(Axis(1))),
+        })
+        .collect();
+    report::write(&dir.join("report.html"), record, &images)?;
     std::fs::write(dir.join("record.json"), record.to_json()).context("record.json")?;
     staging.commit()?;
     Ok(())
