@@ -1,2 +1,38 @@
-//! xtask
-fn main() {}
+//! Tasks of the repository, run as `cargo xtask`: rules checked by a program, and benchmarks against the Python peer.
+//!
+//! They drive the built `sci` and read its run records; nothing here links the solvers.
+
+mod bench;
+mod tidy;
+mod workspace;
+
+use clap::{Parser, Subcommand};
+
+#[derive(Parser)]
+#[command(name = "cargo xtask")]
+enum Task {
+    /// Check the repository's rules
+    Tidy,
+    /// Measure speed, and compare with the Python a user would run instead
+    #[command(subcommand)]
+    Bench(Bench),
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    /// GAP-TV on a gray scene
+    GapTv(bench::Options),
+    /// GAP-FFDNet on a gray scene
+    GapFfdnet(bench::Options),
+    /// 3×3 convolutions
+    Kernels(bench::Options),
+}
+
+fn main() -> anyhow::Result<()> {
+    match Task::parse() {
+        Task::Tidy => tidy::run(),
+        Task::Bench(Bench::GapTv(options)) => bench::solver("gap-tv", &options),
+        Task::Bench(Bench::GapFfdnet(options)) => bench::solver("gap-ffdnet", &options),
+        Task::Bench(Bench::Kernels(options)) => bench::kernels(&options),
+    }
+}

@@ -1,0 +1,203 @@
+//! Benchmarks: this program and the Python peer in turn on one machine, so that only the ratio has to be believed.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+
+use crate::workspace::{built_sci, cargo, json_lines, output, root};
+
+#[derive(clap::Args)]
+pub(crate) struct Options {
+    /// A Python with NumPy, SciPy, scikit-image and PyTorch; without it only our own side is measured
+    #[arg(long, value_name = "PYTHON")]
+    peer: Option<PathBuf>,
+    /// Folder with data/, weights/ and peers/ [default: $SCI_DATA, else ../shared beside the repository]
+    #[arg(long, value_name = "DIR")]
+    shared: Option<PathBuf>,
+    /// Scene file under data/
+    #[arg(long, default_value = "traffic48.mat")]
+    scene: String,
+    /// Runs of each side
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    runs: u32,
+    /// Keep the result as xtask/results/<cpu>/<benchmark>.json
+    #[arg(long)]
+    save: bool,
+}
+
+impl Options {
+    fn shared(&self) -> anyhow::Result<PathBuf> {
+        let named = self.shared.clone().or_else(|| std::env::var_os("SCI_DATA").map(PathBuf::from));
+        let dir = named.unwrap_or_else(|| root().join("../shared"));
+        dir.canonicalize().with_context(|| format!("{}: give --shared DIR", dir.display()))
+    }
+
+    fn peer_script(&self) -> anyhow::Result<Option<(&Path, PathBuf)>> {
+        let Some(python) = &self.peer else {
+            println!("no Python given (--peer PYTHON): measuring our side only");
+            return Ok(None);
+        };
+        let script = self.shared()?.join("peers/peer.py");
+        ensure!(script.is_file(), "{} is missing", script.display());
+        Ok(Some((python, script)))
+    }
+}
+
+/// Seconds of several runs, and the quality, which must not vary.
+#[derive(Default)]
+struct Side {
+    seconds: Vec<f64>,
+    psnr: Vec<f64>,
+    ssim: Vec<f64>,
+}
+
+impl Side {
+    fn push(&mut self, seconds: &Value, psnr: &Value, ssim: &Value) -> anyhow::Result<()> {
+        let number = |v: &Value| v.as_f64().with_context(|| format!("expected a number, found {v}"));
+        self.seconds.push(number(seconds)?);
+        self.psnr.push(number(psnr)?);
+        self.ssim.push(number(ssim)?);
+        Ok(())
+    }
+
+    fn json(&self) -> Value {
+        json!({ "median_seconds": median(&self.seconds), "seconds": self.seconds, "psnr_db": self.psnr[0], "ssim": self.ssim[0] })
+    }
+
+    fn line(&self, name: &str) -> String {
+        let (low, high) = range(&self.seconds);
+        format!(
+            "{name:<5} {:>9.4} s (from {low:.4} to {high:.4}, {} runs)   PSNR {:.3} dB   SSIM {:.4}",
+            median(&self.seconds),
+            self.seconds.len(),
+            self.psnr[0],
+            self.ssim[0]
+        )
+    }
+}
+
+/// `configs/gray/<name>.toml` against `peer.py <name>` on measurement 0.
+pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
+    let shared = options.shared()?;
+    let scene = shared.join("data").join(&options.scene);
+    ensure!(scene.is_file(), "{} is missing", scene.display());
+    let weights = (name == "gap-ffdnet").then(|| shared.join("weights/ffdnet_gray_ipol.pth"));
+    let peer = options.peer_script()?;
+    let sci = built_sci()?;
+    let (mut ours, mut theirs) = (Side::default(), Side::default());
+    for _ in 0..options.runs {
+        let record = run_sci(&sci, name, &scene, weights.as_deref())?;
+        let m = &record["measurements"][0];
+        ours.push(&m["seconds"], &m["psnr_db"], &m["ssim"])?;
+        if let Some((python, script)) = &peer {
+            let printed = output(Command::new(python).arg(script).arg(name).arg(&scene).args(&weights))?;
+            let r = json_lines(&printed).next().context("the peer printed no result")?;
+            theirs.push(&r["seconds"], &r["psnr"], &r["ssim"])?;
+        }
+    }
+    println!("{name} on {}, measurement 0", options.scene);
+    println!("{}", ours.line("sci"));
+    let mut result = json!({ "benchmark": name, "scene": options.scene, "sci": ours.json() });
+    if peer.is_some() {
+        println!("{}", theirs.line("peer"));
+        let ratio = median(&theirs.seconds) / median(&ours.seconds);
+        println!("sci is {ratio:.1} times as fast; PSNR differs by {:+.4} dB", ours.psnr[0] - theirs.psnr[0]);
+        result["peer"] = theirs.json();
+        result["ratio"] = json!(ratio);
+    }
+    save(name, result, options)
+}
+
+fn run_sci(sci: &Path, name: &str, scene: &Path, weights: Option<&Path>) -> anyhow::Result<Value> {
+    let out = std::env::temp_dir().join(format!("sci-bench-{}", std::process::id()));
+    let mut run = Command::new(sci);
+    run.arg("run").arg(root().join(format!("configs/gray/{name}.toml"))).arg("--out").arg(&out);
+    run.arg("--set").arg(format!("data.path={}", scene.display())).args(["--set", "data.measurements=[0]"]);
+    if let Some(weights) = weights {
+        run.arg("--set").arg(format!("denoiser.weights={}", weights.display()));
+    }
+    output(&mut run)?;
+    let record = fs::read_to_string(out.join("record.json"))?;
+    fs::remove_dir_all(&out)?;
+    Ok(serde_json::from_str(&record)?)
+}
+
+/// `cargo bench -p nets --bench kernels` against `peer.py conv`, shape by shape.
+pub(crate) fn kernels(options: &Options) -> anyhow::Result<()> {
+    const TIMES: [(&str, &str); 2] = [("forward", "forward_ms"), ("forward+backward", "forward_backward_ms")];
+    let peer = options.peer_script()?;
+    let ours: Vec<Value> = json_lines(&output(cargo().args(["bench", "-p", "nets", "--bench", "kernels"]))?).collect();
+    let theirs: Vec<Value> = match &peer {
+        Some((python, script)) => json_lines(&output(Command::new(python).arg(script).arg("conv"))?).collect(),
+        None => Vec::new(),
+    };
+    let same = |a: &Value, b: &Value| ["batch", "channels", "size"].iter().all(|k| a[*k] == b[*k]);
+    let mut rows = Vec::new();
+    println!("{:<18} {:<17} {:>10} {:>10} {:>7}", "batch×channels×size", "", "sci ms", "peer ms", "ratio");
+    for row in &ours {
+        for (what, key) in TIMES {
+            let Some(own) = row[key].as_f64() else { continue };
+            let other = theirs.iter().find(|r| same(r, row)).and_then(|r| r[key].as_f64());
+            let ratio = other.map(|o| o / own);
+            let shape = format!("{}×{}×{}²", row["batch"], row["channels"], row["size"]);
+            let cell = |v: Option<f64>| v.map_or("–".to_owned(), |v| format!("{v:.2}"));
+            println!("{shape:<18} {what:<17} {own:>10.2} {:>10} {:>7}", cell(other), cell(ratio));
+            rows.push(json!({ "shape": shape, "what": what, "sci_ms": own, "peer_ms": other, "ratio": ratio }));
+        }
+    }
+    ensure!(!rows.is_empty(), "the kernel benchmark printed no result");
+    let ratios: Vec<f64> = rows.iter().filter_map(|r| r["ratio"].as_f64()).collect();
+    let mut result = json!({ "benchmark": "kernels", "rows": rows });
+    if !ratios.is_empty() {
+        let mean = (ratios.iter().map(|r| r.ln()).sum::<f64>() / ratios.len() as f64).exp();
+        println!("geometric mean of the ratios: {mean:.2}");
+        result["geometric_mean"] = json!(mean);
+    }
+    save("kernels", result, options)
+}
+
+fn save(name: &str, mut result: Value, options: &Options) -> anyhow::Result<()> {
+    if !options.save {
+        return Ok(());
+    }
+    let cpu = cpu();
+    result["cpu"] = json!(cpu);
+    result["revision"] = json!(output(Command::new("git").current_dir(root()).args(["rev-parse", "HEAD"]))?.trim());
+    let folder: String =
+        cpu.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' }).collect();
+    let dir = root().join("xtask/results").join(folder);
+    fs::create_dir_all(&dir)?;
+    let path = dir.join(format!("{name}.json"));
+    fs::write(&path, serde_json::to_string_pretty(&result)? + "\n")?;
+    println!("wrote {}", path.display());
+    Ok(())
+}
+
+fn cpu() -> String {
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = info.lines().find(|l| l.starts_with("model name")).and_then(|l| l.split_once(':'));
+    name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}
+
+fn range(values: &[f64]) -> (f64, f64) {
+    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)))
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let middle = sorted.len() / 2;
+    if sorted.len() % 2 == 1 { sorted[middle] } else { (sorted[middle - 1] + sorted[middle]) / 2.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn medians() {
+        assert_eq!(super::median(&[3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(super::median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
+    }
+}
