@@ -1,7 +1,7 @@
 //! The alternating direction method of multipliers with one splitting.
 
 use crate::{BoxError, DenoiseCx, Denoiser, Problem, Solver};
-use ndarray::{Array3, ArrayView3, Axis, Zip};
+use ndarray::{Array3, ArrayView3, ArrayView4, Axis, Zip};
 use sci_forward::DataStep;
 
 /// ADMM for `min ½‖y − H x‖² + λ g(θ)` subject to `x = θ`, scaled dual `b`:
@@ -77,5 +77,9 @@ impl<D: Denoiser> Solver for Admm<D> {
 
     fn previous<'s>(&self, state: &'s AdmmState) -> ArrayView3<'s, f32> {
         state.previous.view()
+    }
+
+    fn rgb<'s>(&'s self, _: &'s AdmmState) -> Option<ArrayView4<'s, f32>> {
+        self.denoiser.rgb()
     }
 }

@@ -1,7 +1,7 @@
 //! Generalised alternating projection.
 
 use crate::{BoxError, DenoiseCx, Denoiser, Problem, Solver};
-use ndarray::{Array2, Array3, ArrayView3, Axis};
+use ndarray::{Array2, Array3, ArrayView3, ArrayView4, Axis};
 use sci_forward::DataStep;
 
 /// Where the accumulated measurement `y1` of accelerated GAP starts.
@@ -91,5 +91,9 @@ impl<D: Denoiser> Solver for Gap<D> {
 
     fn previous<'s>(&self, state: &'s GapState) -> ArrayView3<'s, f32> {
         state.previous.view()
+    }
+
+    fn rgb<'s>(&'s self, _: &'s GapState) -> Option<ArrayView4<'s, f32>> {
+        self.denoiser.rgb()
     }
 }

@@ -1,5 +1,5 @@
 //! Plug-and-play solvers for snapshot compressive imaging: one loop ([`run`]), solvers that take any [`Denoiser`]
-//! ([`Gap`], [`Admm`]), and priors that need no network ([`Tv`]).
+//! ([`Gap`], [`Admm`], [`TwoStage`] for color sensors), and priors that need no network ([`Tv`]).
 //!
 //! A solver never sees ground truth, files, networks or the clock; observers and the stop rule do.
 //!
@@ -20,6 +20,7 @@
 //! ```
 
 mod admm;
+mod color;
 mod gap;
 mod lanes;
 mod observer;
@@ -28,13 +29,16 @@ mod problem;
 mod schedule;
 mod solver;
 mod tv;
+mod two_stage;
 
 pub use admm::Admm;
+pub use color::{Demosaicked, PerLattice};
 pub use gap::{Gap, MomentumStart};
 pub use observer::{IterInfo, Observer};
-pub use prior::{DenoiseCx, Denoiser, PerStage};
+pub use prior::{Clipped, DenoiseCx, Denoiser, PerStage};
 pub use problem::{Problem, Start};
 pub use schedule::{Plan, Stage, StopRule};
 pub use sci_forward::BoxError;
 pub use solver::{Outcome, SolveError, Solver, StopReason, run};
 pub use tv::Tv;
+pub use two_stage::{Convention, TwoStage, TwoStageParams, XStep};

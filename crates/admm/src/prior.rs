@@ -31,6 +31,11 @@ pub trait Denoiser {
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError>;
+
+    /// The RGB video `[T, 3, H, W]` behind the last output, of a denoiser that works on a mosaic in color.
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        None
+    }
 }
 
 impl<D: Denoiser + ?Sized> Denoiser for &mut D {
@@ -44,6 +49,9 @@ impl<D: Denoiser + ?Sized> Denoiser for &mut D {
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         (**self).denoise(cx, noisy, out)
+    }
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        (**self).rgb()
     }
 }
 
@@ -59,12 +67,17 @@ impl<D: Denoiser + ?Sized> Denoiser for Box<D> {
     ) -> Result<(), BoxError> {
         (**self).denoise(cx, noisy, out)
     }
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        (**self).rgb()
+    }
 }
 
 /// One denoiser for each stage of the schedule, so that a cheap prior can prepare the ground for a dear one.
 pub struct PerStage<'a> {
     denoisers: Vec<Box<dyn Denoiser + 'a>>,
     of_stage: Vec<usize>,
+    /// The denoiser that was called last.
+    last: usize,
     name: String,
 }
 
@@ -76,7 +89,7 @@ impl<'a> PerStage<'a> {
     pub fn new(denoisers: Vec<Box<dyn Denoiser + 'a>>, of_stage: Vec<usize>) -> Self {
         assert!(of_stage.iter().all(|&i| i < denoisers.len()), "every stage names a denoiser");
         let name = denoisers.iter().map(|d| d.name()).collect::<Vec<_>>().join(" → ");
-        Self { denoisers, of_stage, name }
+        Self { denoisers, of_stage, last: 0, name }
     }
 }
 
@@ -93,6 +106,38 @@ impl Denoiser for PerStage<'_> {
         let Some(&index) = self.of_stage.get(cx.stage) else {
             return Err(format!("stage {} has no denoiser: there are {}", cx.stage, self.of_stage.len()).into());
         };
+        self.last = index;
         self.denoisers[index].denoise(cx, noisy, out)
     }
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        self.denoisers[self.last].rgb()
+    }
+}
+
+/// Clips the output of a denoiser to `[0, 1]`.
+#[derive(Debug, Clone)]
+pub struct Clipped<D>(pub D);
+
+impl<D: Denoiser> Denoiser for Clipped<D> {
+    fn name(&self) -> &str {
+        self.0.name()
+    }
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        self.0.denoise(cx, noisy, out.view_mut())?;
+        out.par_mapv_inplace(clip);
+        Ok(())
+    }
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        self.0.rgb()
+    }
+}
+
+/// Into `[0, 1]`; a NaN stays one.
+pub(crate) fn clip(v: f32) -> f32 {
+    v.clamp(0.0, 1.0)
 }

@@ -1,6 +1,6 @@
 //! What is solved, and from where.
 
-use crate::{DenoiseCx, Denoiser, SolveError, Tv};
+use crate::{Clipped, DenoiseCx, Denoiser, PerLattice, SolveError, Tv};
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Zip};
 use sci_forward::{DataStep, SensingOperator};
 
@@ -62,12 +62,15 @@ pub enum Start<'a> {
     Adjoint,
     /// A given video `[T, H, W]`, for example the result of the previous measurement.
     From(ArrayView3<'a, f32>),
-    /// So many iterations of plain GAP with a TV prior of this weight, from [`Start::Mean`].
+    /// The reference code's warm start: so many iterations of ADMM with a TV prior and γ = 0.01 from `Hᵀ y`, θ clipped to
+    /// `[0, 1]`, of which the projection is taken. On a color sensor TV works on the four sub-lattices.
     Tv {
-        /// GAP iterations.
+        /// Iterations.
         iterations: usize,
-        /// Weight of [`Tv`].
+        /// Weight of [`Tv`](crate::Tv).
         weight: f32,
+        /// Whether the sensor is a Bayer sensor.
+        bayer: bool,
     },
 }
 
@@ -92,21 +95,30 @@ impl Start<'_> {
                 }
                 Ok(video.as_standard_layout().into_owned())
             }
-            Self::Tv { iterations, weight } => {
-                let mut tv = Tv::new(weight);
-                let mut x = mean(problem);
-                let mut projected = x.clone();
-                for iteration in 0..iterations {
-                    let step = DataStep { y: problem.y, damping: 0.0, momentum: None };
-                    problem.operator.data_step(step, x.view(), projected.view_mut());
-                    let cx = DenoiseCx { sigma: 0.0, iteration, stage: 0 };
-                    tv.denoise(&cx, projected.view().insert_axis(Axis(1)), x.view_mut().insert_axis(Axis(1)))
-                        .map_err(|source| SolveError::Denoiser { name: tv.name().into(), iteration, source })?;
-                }
-                Ok(x)
+            Self::Tv { iterations, weight, bayer: false } => admm_tv(problem, iterations, Clipped(Tv::new(weight))),
+            Self::Tv { iterations, weight, bayer: true } => {
+                admm_tv(problem, iterations, Clipped(PerLattice::new(Tv::new(weight))))
             }
         }
     }
+}
+
+fn admm_tv(problem: &Problem<'_>, iterations: usize, mut tv: impl Denoiser) -> Result<Array3<f32>, SolveError> {
+    let mut theta = problem.operator.adjoint(problem.y);
+    let mut b = Array3::<f32>::zeros(theta.dim());
+    let (mut p, mut x) = (b.clone(), theta.clone());
+    for iteration in 0..iterations {
+        Zip::from(&mut p).and(&theta).and(&b).par_for_each(|p, &theta, &b| *p = theta + b);
+        let step = DataStep { y: problem.y, damping: 0.01, momentum: None };
+        problem.operator.data_step(step, p.view(), x.view_mut());
+        Zip::from(&mut p).and(&x).and(&b).par_for_each(|z, &x, &b| *z = x - b);
+        let cx = DenoiseCx { sigma: 0.0, iteration, stage: 0 };
+        tv.denoise(&cx, p.view().insert_axis(Axis(1)), theta.view_mut().insert_axis(Axis(1)))
+            .map_err(|source| SolveError::Denoiser { name: tv.name().into(), iteration, source })?;
+        // b ← b − (x − θ) = θ − (x − b).
+        Zip::from(&mut b).and(&theta).and(&p).par_for_each(|b, &theta, &z| *b = theta - z);
+    }
+    Ok(x)
 }
 
 fn mean(problem: &Problem<'_>) -> Array3<f32> {

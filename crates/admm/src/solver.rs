@@ -88,13 +88,8 @@ pub trait Solver {
     /// The estimate of the iteration before (of the start, after the first), `[T, H, W]`.
     fn previous<'s>(&self, state: &'s Self::State) -> ArrayView3<'s, f32>;
 
-    /// The RGB estimate `[T, 3, H, W]` of a color solver.
-    fn rgb<'s>(&self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
-        None
-    }
-
-    /// The RGB estimate of the iteration before (nothing, after the first).
-    fn previous_rgb<'s>(&self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
+    /// The RGB estimate `[T, 3, H, W]` of a color solver, after a step.
+    fn rgb<'s>(&'s self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
         None
     }
 }
@@ -106,7 +101,7 @@ pub struct Outcome<S> {
     pub state: S,
     /// The estimate `[T, H, W]`, always finite: after a divergence the last good one.
     pub estimate: Array3<f32>,
-    /// The RGB estimate `[T, 3, H, W]` of a color solver that belongs to `estimate`.
+    /// The RGB estimate `[T, 3, H, W]` of a color solver that belongs to `estimate`; nothing after a divergence.
     pub rgb: Option<Array4<f32>>,
     /// Why the run ended.
     pub stop: StopReason,
@@ -173,10 +168,9 @@ pub fn run<S: Solver>(
         }
     }
     let (estimate, rgb) = match stop {
-        StopReason::Diverged => (solver.previous(&state), solver.previous_rgb(&state)),
-        _ => (solver.estimate(&state), solver.rgb(&state)),
+        StopReason::Diverged => (solver.previous(&state).to_owned(), None),
+        _ => (solver.estimate(&state).to_owned(), solver.rgb(&state).map(|rgb| rgb.to_owned())),
     };
-    let (estimate, rgb) = (estimate.to_owned(), rgb.map(|rgb| rgb.to_owned()));
     let seconds = clock.elapsed().as_secs_f64();
     Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual })
 }

@@ -158,13 +158,13 @@ impl Scratch {
     }
 
     fn denoise_plane(&mut self, call: &Call, image: &[f32], out: &mut [f32], field: &mut Field) {
-        let mut steps = call.inner - 1;
+        // From a dual of 0 the first of scikit-image's iterations has nothing to add to the output; a kept dual has.
+        let warm = !field[0].is_empty();
+        let mut steps = if warm { call.inner } else { call.inner - 1 };
         self.run(call, steps, image, out, field);
         // The energies are known when the sweep is over. If the steps should have ended early, fewer are swept again:
         // on a video that is still noisy this does not happen.
-        if field[0].is_empty()
-            && let Some(early) = self.early_end(steps)
-        {
+        if !warm && let Some(early) = self.early_end(steps) {
             steps = early;
             self.run(call, steps, image, out, field);
         }

@@ -84,7 +84,12 @@ fn gap_with_no_prior_is_the_projection() {
 fn every_start_and_solver_recovers_a_simple_scene() {
     let truth = moving_square(SHAPE);
     let previous = Array3::from_elem(SHAPE.dim(), 0.4);
-    let starts = [Start::Mean, Start::Adjoint, Start::From(previous.view()), Start::Tv { iterations: 10, weight: 0.1 }];
+    let starts = [
+        Start::Mean,
+        Start::Adjoint,
+        Start::From(previous.view()),
+        Start::Tv { iterations: 10, weight: 0.1, bayer: false },
+    ];
     let rmse = |x: &Array3<f32>| (x - &truth).mapv(|d| d * d).mean().unwrap().sqrt();
     for start in starts {
         let estimates = [
@@ -202,7 +207,9 @@ fn inputs_of_the_wrong_size_or_not_finite_are_refused() {
 fn results_are_the_same_bits_for_any_thread_count_and_run() {
     let solve_with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| solve(Gap::accelerated(Tv::new(0.1)), Start::Tv { iterations: 3, weight: 0.2 }, &stages(20)))
+        pool.install(|| {
+            solve(Gap::accelerated(Tv::new(0.1)), Start::Tv { iterations: 3, weight: 0.2, bayer: false }, &stages(20))
+        })
     };
     let (one, two, again) = (solve_with(1), solve_with(2), solve_with(2));
     assert_eq!(one.estimate, two.estimate);

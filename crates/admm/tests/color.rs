@@ -1,0 +1,275 @@
+//! Color solvers: exact fixed points, gray scenes through the color path, and the symmetry of the patterns.
+
+use admm::*;
+use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, s};
+use sci_forward::bayer::{Bilinear, CfaPattern, Demosaicer, Malvar, mosaic_into};
+use sci_forward::testing::{moving_square, uniform};
+use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+
+/// `D(x) = a x`.
+struct Scale(f32);
+
+impl Denoiser for Scale {
+    fn name(&self) -> &str {
+        "scale"
+    }
+    fn denoise(
+        &mut self,
+        _: &DenoiseCx,
+        x: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        out.assign(&x.mapv(|v| v * self.0));
+        Ok(())
+    }
+}
+
+fn problem_data(shape: VideoShape) -> (MaskOperator, Array2<f32>) {
+    let h = MaskOperator::new(MaskStack::random(shape, 0.6, 4).unwrap());
+    let y = h.forward(uniform(shape.dim(), 5).view());
+    (h, y)
+}
+
+/// Solves `A z = c` in `f64` by elimination with pivots.
+fn dense_solve(mut a: Array2<f64>, mut c: Array1<f64>) -> Array1<f64> {
+    let n = c.len();
+    for k in 0..n {
+        let pivot = (k..n).max_by(|&i, &j| a[[i, k]].abs().total_cmp(&a[[j, k]].abs())).unwrap();
+        for j in 0..n {
+            a.swap([k, j], [pivot, j]);
+        }
+        c.swap(k, pivot);
+        for i in k + 1..n {
+            let f = a[[i, k]] / a[[k, k]];
+            for j in k..n {
+                let v = a[[k, j]];
+                a[[i, j]] -= f * v;
+            }
+            c[i] -= f * c[k];
+        }
+    }
+    for k in (0..n).rev() {
+        let sum: f64 = (k + 1..n).map(|j| a[[k, j]] * c[j]).sum();
+        c[k] = (c[k] - sum) / a[[k, k]];
+    }
+    c
+}
+
+/// The matrix of a linear map on videos, column by column.
+fn matrix(n: usize, m: usize, map: impl Fn(&Array1<f32>) -> Array1<f32>) -> Array2<f64> {
+    let mut a = Array2::zeros((m, n));
+    for k in 0..n {
+        let mut e = Array1::zeros(n);
+        e[k] = 1.0f32;
+        a.column_mut(k).assign(&map(&e).mapv(f64::from));
+    }
+    a
+}
+
+const TINY: VideoShape = VideoShape { frames: 2, height: 4, width: 4 };
+const CFA: CfaPattern = CfaPattern::Grbg;
+
+fn h_matrix(h: &MaskOperator) -> Array2<f64> {
+    matrix(32, 16, |x| h.forward(x.to_shape(TINY.dim()).unwrap().view()).flatten().to_owned())
+}
+
+fn t_matrix() -> Array2<f64> {
+    matrix(96, 32, |x| {
+        let mut m = Array3::zeros(TINY.dim());
+        mosaic_into(CFA, x.to_shape((2, 3, 4, 4)).unwrap().view(), m.view_mut());
+        m.flatten().to_owned()
+    })
+}
+
+fn demosaic_matrix(method: &mut dyn Demosaicer) -> Array2<f64> {
+    let method = std::cell::RefCell::new(method);
+    matrix(32, 96, |m| {
+        let mut rgb = Array4::zeros((2, 3, 4, 4));
+        method.borrow_mut().demosaic(CFA, m.to_shape(TINY.dim()).unwrap().view(), rgb.view_mut()).unwrap();
+        rgb.flatten().to_owned()
+    })
+}
+
+fn solve(
+    x_step: XStep,
+    params: TwoStageParams,
+    a: f32,
+    iterations: usize,
+) -> (MaskOperator, Array2<f32>, Array3<f32>, Array4<f32>) {
+    let (h, y) = problem_data(TINY);
+    let mut solver = TwoStage::new(Scale(a), Bilinear, x_step, CFA, params);
+    let plan = Plan::new([Stage { sigma: 0.1, iterations }]);
+    let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
+    assert_ne!(outcome.stop, StopReason::Diverged);
+    (h, y, outcome.estimate, outcome.rgb.unwrap())
+}
+
+fn assert_close(a: impl IntoIterator<Item = f32>, b: impl IntoIterator<Item = f64>, tolerance: f64) {
+    let worst = a.into_iter().zip(b).fold(0f64, |m, (a, b)| m.max((f64::from(a) - b).abs()));
+    assert!(worst < tolerance, "largest difference {worst}");
+}
+
+/// Scaled, closed form: v solves `min ½‖y − H T v‖² + μ/2 ‖v‖²`, `μ = τ (1/a − 1)`, as `a x` is the prox of that prior.
+#[test]
+fn scaled_closed_form_reaches_the_exact_minimiser() {
+    let (a, tau) = (0.8f32, 0.5f32);
+    let params = TwoStageParams { rho: 0.7, tau, alpha: 1.0, convention: Convention::Scaled };
+    let (h, y, _, rgb) = solve(XStep::ClosedForm { clip: false }, params, a, 3000);
+    let ht = h_matrix(&h).dot(&t_matrix());
+    let mu = f64::from(tau) * (1.0 / f64::from(a) - 1.0);
+    let normal = ht.t().dot(&ht) + Array2::<f64>::eye(96) * mu;
+    let v = dense_solve(normal, ht.t().dot(&y.mapv(f64::from).flatten().to_owned()));
+    assert_close(rgb, v, 1e-4);
+}
+
+/// Scaled, demosaicer `M`, `D = a`: at the fixed point `v = a M (q + b)`, `q = T v`, and `Hᵀ (y − H q) = ρ b`.
+#[test]
+fn scaled_demosaicing_reaches_its_exact_fixed_point() {
+    let (a, rho) = (0.8f64, 0.7f64);
+    let params = TwoStageParams { rho: rho as f32, tau: 1.0, alpha: 1.0, convention: Convention::Scaled };
+    let (h, y, theta, _) = solve(XStep::Demosaic, params, a as f32, 3000);
+    let (hm, y) = (h_matrix(&h), y.mapv(f64::from).flatten().to_owned());
+    // T M = 1, so q = a (q + b), b = (1/a − 1) q, and (HᵀH + ρ (1/a − 1)) q = Hᵀ y.
+    assert!((t_matrix().dot(&demosaic_matrix(&mut Bilinear)) - Array2::<f64>::eye(32)).iter().all(|v| v.abs() < 1e-6));
+    let q = dense_solve(hm.t().dot(&hm) + Array2::<f64>::eye(32) * (rho * (1.0 / a - 1.0)), hm.t().dot(&y));
+    assert_close(theta, q, 1e-4);
+}
+
+/// The paper's convention with `D = 1`: `w` stays 0, `q = T x = q + b` makes `b` 0, so that `H q = y` and `x = M q` are left.
+/// (With a denoiser that shrinks there is no other fixed point than 0: see the rustdoc of the convention.)
+#[test]
+fn the_papers_convention_reaches_its_exact_fixed_point() {
+    let params = TwoStageParams { rho: 1.0, tau: 2.0, alpha: 1.0, convention: Convention::PaperCode };
+    let h = MaskOperator::new(MaskStack::random(TINY, 0.6, 4).unwrap());
+    let y = h.forward(uniform(TINY.dim(), 5).mapv(|v| 0.3 + 0.2 * v).view());
+    let mut solver = TwoStage::new(Scale(1.0), Bilinear, XStep::Demosaic, CFA, params);
+    let plan = Plan::new([Stage { sigma: 0.1, iterations: 400 }]);
+    let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
+    let theta = &outcome.estimate;
+    assert!(theta.iter().all(|&v| v > 0.0 && v < 1.0), "{theta}");
+    assert!(outcome.relative_residual < 1e-6, "{}", outcome.relative_residual);
+    let q = theta.mapv(f64::from).flatten().to_owned();
+    assert_close(outcome.rgb.unwrap(), demosaic_matrix(&mut Bilinear).dot(&q), 1e-5);
+}
+
+/// One step of the paper's closed form against a dense solve of `(ρ TᵀT + τ) x = ρ Tᵀ q + Tᵀ b + τ v + w`.
+#[test]
+fn the_papers_closed_form_is_the_dense_solution() {
+    let params = TwoStageParams { rho: 0.55, tau: 10.0, alpha: 1.0, convention: Convention::PaperCode };
+    let (rho, tau) = (0.55f64, 10.0f64);
+    let (h, y) = problem_data(TINY);
+    let (hm, tm, mm) = (h_matrix(&h), t_matrix(), demosaic_matrix(&mut Bilinear));
+    let (a, y64) = (0.95f64, y.mapv(f64::from).flatten().to_owned());
+    // Two iterations by the definition, in f64.
+    let (mut theta, mut b, mut w) = (Array1::<f64>::zeros(32), Array1::<f64>::zeros(32), Array1::<f64>::zeros(96));
+    let mut v = Array1::<f64>::zeros(96);
+    let start = uniform(TINY.dim(), 6);
+    theta.assign(&start.mapv(f64::from).flatten());
+    let gram = hm.dot(&hm.t());
+    for k in 0..3 {
+        let p = &theta - &b / rho;
+        let mut r = &y64 - &hm.dot(&p);
+        for i in 0..16 {
+            r[i] /= gram[[i, i]] + rho;
+        }
+        let q = &p + &hm.t().dot(&r);
+        let x = if k == 0 {
+            mm.dot(&(&q + &b / rho))
+        } else {
+            let normal = tm.t().dot(&tm) * rho + Array2::<f64>::eye(96) * tau;
+            dense_solve(normal, tm.t().dot(&(&q * rho + &b)) + &v * tau + &w)
+        };
+        v = (&x - &w / tau) * a;
+        let raw = tm.dot(&v);
+        theta = raw.mapv(|v| v.clamp(0.0, 1.0));
+        b = b + (if k == 0 { raw } else { q }) - &theta;
+        w = w + &x - &v;
+    }
+    let mut solver = TwoStage::new(Scale(a as f32), Bilinear, XStep::ClosedForm { clip: false }, CFA, params);
+    let plan = Plan::new([Stage { sigma: 0.1, iterations: 3 }]);
+    let outcome =
+        run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::From(start.view()), &plan, &mut ()).unwrap();
+    assert_close(outcome.estimate, theta, 1e-5);
+    assert_close(outcome.rgb.unwrap(), v, 1e-5);
+}
+
+/// A mosaic of a gray scene whose demosaicing is exact (a plane) goes through the color path as through the gray one.
+#[test]
+fn a_gray_scene_through_the_color_path_equals_the_gray_path() {
+    let shape = VideoShape { frames: 4, height: 16, width: 12 };
+    let (h, _) = problem_data(shape);
+    let flat = Array3::from_shape_fn(shape.dim(), |(t, _, _)| 0.2 + 0.1 * t as f32);
+    let y = h.forward(flat.view());
+    let problem = Problem::new(&h, y.view()).unwrap();
+    let plan = Plan::new([Stage { sigma: 0.0, iterations: 30 }]);
+    // Frame by frame the mean, the same for every color.
+    struct FrameMean;
+    impl Denoiser for FrameMean {
+        fn name(&self) -> &str {
+            "frame mean"
+        }
+        fn denoise(
+            &mut self,
+            _: &DenoiseCx,
+            x: ArrayView4<'_, f32>,
+            mut out: ArrayViewMut4<'_, f32>,
+        ) -> Result<(), BoxError> {
+            for (x, mut out) in x.outer_iter().zip(out.outer_iter_mut()) {
+                out.fill(x.mean().unwrap());
+            }
+            Ok(())
+        }
+    }
+    let gray = run(&mut Gap::plain(FrameMean), &problem, Start::Mean, &plan, &mut ()).unwrap();
+    let color = Demosaicked::new(FrameMean, Malvar, CfaPattern::Rggb);
+    let color = run(&mut Gap::plain(color), &problem, Start::Mean, &plan, &mut ()).unwrap();
+    let worst = (&gray.estimate - &color.estimate).fold(0f32, |m, d| m.max(d.abs()));
+    // Malvar's green and red means of a noisy mosaic differ a little from the mosaic's own; the limit is the same.
+    assert!(worst < 5e-3, "{worst}");
+    let rgb = color.rgb.unwrap();
+    assert_eq!(rgb.slice(s![.., 0, .., ..]), rgb.slice(s![.., 2, .., ..]));
+}
+
+/// The same scene seen through a shifted sensor (masks, scene and pattern shifted along) gives the same quality.
+#[test]
+fn the_four_patterns_give_the_same_result_up_to_the_shift() {
+    let big = VideoShape { frames: 4, height: 98, width: 98 };
+    let masks = MaskStack::random(big, 0.5, 7).unwrap();
+    let scene = moving_square(big);
+    let psnr = |cfa: CfaPattern, top: usize, left: usize| {
+        let crop = |v: ArrayView3<'_, f32>| v.slice(s![.., top..top + 96, left..left + 96]).to_owned();
+        let h = MaskOperator::new(MaskStack::new(crop(masks.view())).unwrap());
+        let truth = crop(scene.view());
+        let y = h.forward(truth.view());
+        let params = TwoStageParams { rho: 1.0, tau: 100.0, alpha: 1.0, convention: Convention::PaperCode };
+        let mut solver = TwoStage::new(Tv::new(0.1), Malvar, XStep::Demosaic, cfa, params);
+        let plan = Plan::new([Stage { sigma: 0.0, iterations: 20 }]);
+        let start = Start::Tv { iterations: 20, weight: 0.1, bayer: true };
+        let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), start, &plan, &mut ()).unwrap();
+        let inner = s![.., 16..80, 16..80];
+        let (shifted, truth) = (outcome.estimate, truth);
+        let mse = (&shifted.slice(inner) - &truth.slice(inner)).mapv(|d| d * d).mean().unwrap();
+        -10.0 * mse.log10()
+    };
+    let reference = psnr(CfaPattern::Rggb, 0, 0);
+    assert!(reference > 18.0, "{reference}");
+    for (cfa, top, left) in [(CfaPattern::Grbg, 0, 1), (CfaPattern::Gbrg, 1, 0), (CfaPattern::Bggr, 1, 1)] {
+        let shifted = psnr(cfa, top, left);
+        assert!((shifted - reference).abs() < 0.5, "{cfa}: {shifted} dB, RGGB {reference} dB");
+    }
+}
+
+#[test]
+fn sub_lattices_are_denoised_apart() {
+    let noisy = uniform((2, 1, 20, 24), 3);
+    let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
+    let cx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
+    PerLattice::new(Tv::new(0.1)).denoise(&cx, noisy.view(), out.view_mut()).unwrap();
+    for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+        let lattice = noisy.slice(s![.., .., row..;2, column..;2]).to_owned();
+        let mut alone = Array4::zeros(lattice.dim());
+        Tv::new(0.1).denoise(&cx, lattice.view(), alone.view_mut()).unwrap();
+        assert_eq!(out.slice(s![.., .., row..;2, column..;2]), alone);
+    }
+    assert!(out.iter().all(|v| v.is_finite()));
+}
