@@ -186,12 +186,13 @@ impl Ffdnet {
         let engine = self.cache.engine(&convs, &[])?;
         engine.start(half_h, half_w);
         let mut z = engine.image(4 * c + 1, half_h, half_w);
-        set_channel(&mut z, if residual { 0 } else { 4 * c }, |_, _| sigma);
+        set_channel(&mut z, if residual { 0 } else { 4 * c }, |_| std::iter::repeat(sigma));
         for channel in 0..4 * c {
             let (color, i, j) = (channel / 4, channel / 2 % 2, channel % 2);
             let at = |i, n| Padding::Replicate.source(i, n);
-            set_channel(&mut z, channel + usize::from(residual), |y, x| {
-                frame[[color, at(2 * y + i, h), at(2 * x + j, w)]]
+            set_channel(&mut z, channel + usize::from(residual), |y| {
+                let row = frame.slice(s![color, at(2 * y + i, h), ..]);
+                (0..half_w).map(move |x| row[at(2 * x + j, w)])
             });
         }
         let z = engine.chain(0..self.spec.depth, z)?;

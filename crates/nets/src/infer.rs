@@ -141,13 +141,13 @@ pub(crate) fn add_shuffled(quarters: &Blocked, image: &mut Blocked) {
     }
 }
 
-/// Sets one channel of an image, `value(y, x)`.
-pub(crate) fn set_channel(image: &mut Blocked, channel: usize, value: impl Fn(usize, usize) -> f32) {
+/// Sets one channel of an image, row by row.
+pub(crate) fn set_channel<I: IntoIterator<Item = f32>>(image: &mut Blocked, channel: usize, row: impl Fn(usize) -> I) {
     let (_, height, _) = image.shape();
     for y in 0..height {
-        let row = image.row_mut(channel / LANES, y).as_chunks_mut::<LANES>().0;
-        for (x, pixel) in row.iter_mut().enumerate() {
-            pixel[channel % LANES] = value(y, x);
+        let pixels = image.row_mut(channel / LANES, y).as_chunks_mut::<LANES>().0;
+        for (pixel, value) in pixels.iter_mut().zip(row(y)) {
+            pixel[channel % LANES] = value;
         }
     }
 }

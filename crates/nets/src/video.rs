@@ -267,12 +267,14 @@ impl BlockRun<'_> {
         let (c, h, w) = frames[1].dim();
         let each = c + usize::from(self.spec.noise_map);
         let mut input = self.engine.image(3 * each, h, w);
-        for (k, frame) in frames.iter().enumerate() {
+        for (k, frame) in frames.into_iter().enumerate() {
             for channel in 0..c {
-                set_channel(&mut input, k * each + channel, |y, x| frame[[channel, y, x]]);
+                set_channel(&mut input, k * each + channel, |y| {
+                    frame.slice_move(ndarray::s![channel, y, ..]).into_iter().copied()
+                });
             }
             if self.spec.noise_map {
-                set_channel(&mut input, k * each + c, |_, _| self.sigma);
+                set_channel(&mut input, k * each + c, |_| std::iter::repeat(self.sigma));
             }
         }
         let found = self.block(first, input)?;

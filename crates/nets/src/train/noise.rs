@@ -22,5 +22,5 @@ pub(super) fn sensor(rgb: ArrayView4<'_, f32>) -> Array4<f32> {
 /// The RGGB mosaic `[T, H, W]`.
 fn mosaic(rgb: ArrayView4<'_, f32>) -> Array3<f32> {
     let dim = (rgb.len_of(Axis(0)), rgb.len_of(Axis(2)), rgb.len_of(Axis(3)));
-    Array3::from_shape_fn(dim, |(t, y, x)| rgb[[t, CfaPattern::Rggb.color_at(y, x), y, x]])
+    Array3::from_shape_fn(dim, |(t, y, x)| rgb[[t, CfaPattern::Rggb.color_at(y, x) as usize, y, x]])
 }

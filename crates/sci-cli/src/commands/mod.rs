@@ -15,6 +15,7 @@ mod metrics;
 mod report;
 mod run;
 mod simulate;
+mod train;
 mod weights;
 
 use std::path::Path;
@@ -47,7 +48,9 @@ enum Command {
     Mask(mask::Args),
     /// Compare two videos: PSNR and SSIM
     Metrics(metrics::Args),
-    /// Look into weight files
+    /// Train a network
+    Train(train::Args),
+    /// Look into weight files, and convert them
     #[command(subcommand)]
     Weights(weights::Command),
     /// Compare finished runs
@@ -94,6 +97,7 @@ impl Cli {
             Command::Simulate(args) => args.run(),
             Command::Mask(args) => args.run(),
             Command::Metrics(args) => args.run(),
+            Command::Train(args) => args.run(),
             Command::Weights(command) => command.run(),
             Command::Report(args) => args.run(),
         }
