@@ -10,7 +10,6 @@ use crate::lanes::{Lanes, MAX_LANES, Portable};
 use crate::{BoxError, DenoiseCx, Denoiser};
 use ndarray::parallel::prelude::*;
 use ndarray::{ArrayView2, ArrayView4, ArrayViewMut2, ArrayViewMut4, Axis};
-use rayon::slice::ParallelSliceMut;
 
 /// Dual step, 1 / (2 · dimensions).
 const TAU: f32 = 0.25;
@@ -24,7 +23,6 @@ const ENERGY_TOLERANCE: f64 = 2e-4;
 /// |---|---|---|---|
 /// | `weight` | – | strength | > 0, finite |
 /// | [`inner`](Tv::inner) | 5 | iterations a call, the last of which only forms the output | ≥ 1 |
-/// | [`warm_dual`](Tv::warm_dual) | off | start from the last call's dual instead of 0 | |
 ///
 /// With the defaults it is scikit-image's `denoise_tv_chambolle(frame, weight, max_num_iter=5)`, which is what the
 /// reference codes call, with its early end: the iterations stop as soon as the energy changes by less than 2e-4 of its
@@ -36,10 +34,8 @@ const ENERGY_TOLERANCE: f64 = 2e-4;
 pub struct Tv {
     weight: f32,
     inner: usize,
-    warm_dual: bool,
     sweep: Sweep,
     scratch: Vec<Scratch>,
-    fields: Vec<Field>,
 }
 
 /// What one thread needs to denoise a plane: the steps in flight, and where strided rows are packed.
@@ -59,10 +55,8 @@ struct Level {
     energy: f64,
 }
 
-/// The two components of the dual, one row or one plane of each.
+/// A row of each of the two components of the dual.
 type Rows = [Vec<f32>; 2];
-/// The dual of a plane that is kept from call to call; empty before the first.
-type Field = Rows;
 
 impl Tv {
     /// TV of this weight.
@@ -72,21 +66,13 @@ impl Tv {
     pub fn new(weight: f32) -> Self {
         assert!(weight > 0.0 && weight.is_finite(), "TV weight {weight} must be finite and greater than 0");
         let sweep = Sweep::available()[0];
-        Self { weight, inner: 5, warm_dual: false, sweep, scratch: Vec::new(), fields: Vec::new() }
+        Self { weight, inner: 5, sweep, scratch: Vec::new() }
     }
 
     /// Iterations a call, at least 1.
     #[must_use]
     pub fn inner(mut self, iterations: usize) -> Self {
         self.inner = iterations.max(1);
-        self
-    }
-
-    /// Starts each call from the dual field of the call before, and never ends it early: inside a solver, where the input
-    /// changes little from call to call, a few iterations then do the work of many.
-    #[must_use]
-    pub fn warm_dual(mut self, on: bool) -> Self {
-        self.warm_dual = on;
         self
     }
 }
@@ -102,28 +88,23 @@ impl Denoiser for Tv {
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        let (frames, channels, height, width) = noisy.dim();
+        let (frames, _, _, width) = noisy.dim();
         if noisy.is_empty() {
             return Ok(());
         }
         // One scratch a thread; which thread takes which frames does not matter to the result.
         let group = frames.div_ceil(rayon::current_num_threads());
         self.scratch.resize_with(frames.div_ceil(group), Scratch::default);
-        self.fields.resize_with(frames * channels, Field::default);
-        let field_size = if self.warm_dual { height * width } else { 0 };
         let sweep = if width < self.sweep.lanes { Sweep::SCALAR } else { self.sweep };
         let call = Call { width, weight: self.weight, inner: self.inner, sweep };
         out.axis_chunks_iter_mut(Axis(0), group)
             .into_par_iter()
             .zip(noisy.axis_chunks_iter(Axis(0), group))
             .zip(&mut self.scratch)
-            .zip(self.fields.par_chunks_mut(group * channels))
-            .for_each(|(((mut out, noisy), scratch), fields)| {
-                let mut fields = fields.iter_mut();
+            .for_each(|((mut out, noisy), scratch)| {
                 for (mut out, noisy) in out.outer_iter_mut().zip(noisy.outer_iter()) {
-                    for ((out, noisy), field) in out.outer_iter_mut().zip(noisy.outer_iter()).zip(&mut fields) {
-                        field.iter_mut().filter(|p| p.len() != field_size).for_each(|p| *p = vec![0.0; field_size]);
-                        scratch.denoise(&call, noisy, out, field);
+                    for (out, noisy) in out.outer_iter_mut().zip(noisy.outer_iter()) {
+                        scratch.denoise(&call, noisy, out);
                     }
                 }
             });
@@ -141,36 +122,34 @@ struct Call {
 }
 
 impl Scratch {
-    fn denoise(&mut self, call: &Call, image: ArrayView2<'_, f32>, mut out: ArrayViewMut2<'_, f32>, field: &mut Field) {
+    fn denoise(&mut self, call: &Call, image: ArrayView2<'_, f32>, mut out: ArrayViewMut2<'_, f32>) {
         // The sub-lattices of a mosaic come as strided views; the sweep works on rows in memory order.
         let image = image.as_standard_layout();
         let image = image.as_slice().expect("a standard layout is a slice");
         match out.as_slice_mut() {
-            Some(out) => self.denoise_plane(call, image, out, field),
+            Some(out) => self.denoise_plane(call, image, out),
             None => {
                 let mut packed = std::mem::take(&mut self.packed);
                 packed.resize(image.len(), 0.0);
-                self.denoise_plane(call, image, &mut packed, field);
+                self.denoise_plane(call, image, &mut packed);
                 out.iter_mut().zip(&packed).for_each(|(out, v)| *out = *v);
                 self.packed = packed;
             }
         }
     }
 
-    fn denoise_plane(&mut self, call: &Call, image: &[f32], out: &mut [f32], field: &mut Field) {
-        // From a dual of 0 the first of scikit-image's iterations has nothing to add to the output; a kept dual has.
-        let warm = !field[0].is_empty();
-        let mut steps = if warm { call.inner } else { call.inner - 1 };
-        self.run(call, steps, image, out, field);
+    fn denoise_plane(&mut self, call: &Call, image: &[f32], out: &mut [f32]) {
+        let mut steps = call.inner - 1;
+        self.run(call, steps, image, out);
         // The energies are known when the sweep is over. If the steps should have ended early, fewer are swept again:
         // on a video that is still noisy this does not happen.
-        if !warm && let Some(early) = self.early_end(steps) {
+        if let Some(early) = self.early_end(steps) {
             steps = early;
-            self.run(call, steps, image, out, field);
+            self.run(call, steps, image, out);
         }
     }
 
-    fn run(&mut self, call: &Call, steps: usize, image: &[f32], out: &mut [f32], field: &mut Field) {
+    fn run(&mut self, call: &Call, steps: usize, image: &[f32], out: &mut [f32]) {
         let rows = |length| [vec![0.0; length], vec![0.0; length]];
         let level =
             || Level { dual: [rows(call.width + 1), rows(call.width + 1)], primal: rows(call.width + 1), energy: 0.0 };
@@ -179,7 +158,7 @@ impl Scratch {
         }
         self.levels.resize_with(steps + 1, level);
         // SAFETY: `Sweep::available` has checked the instruction set; rows have at least a vector's width.
-        unsafe { (call.sweep.run)(&mut self.levels, image, call.weight, field, out) }
+        unsafe { (call.sweep.run)(&mut self.levels, image, call.weight, out) }
     }
 
     /// The number of steps after which the energy had settled, if that is less than `steps`.
@@ -192,7 +171,7 @@ impl Scratch {
 /// [`sweep`] compiled for one instruction set.
 #[derive(Debug, Clone, Copy)]
 struct Sweep {
-    run: unsafe fn(&mut [Level], &[f32], f32, &mut Field, &mut [f32]),
+    run: unsafe fn(&mut [Level], &[f32], f32, &mut [f32]),
     /// The narrowest row that it can take.
     lanes: usize,
 }
@@ -200,9 +179,9 @@ struct Sweep {
 macro_rules! compiled {
     ($lanes:ty $(, $features:literal)?) => {{
         $(#[target_feature(enable = $features)])?
-        unsafe fn compiled(levels: &mut [Level], image: &[f32], weight: f32, field: &mut Field, out: &mut [f32]) {
+        unsafe fn compiled(levels: &mut [Level], image: &[f32], weight: f32, out: &mut [f32]) {
             // SAFETY: the caller's; the features are those of the vector.
-            unsafe { sweep::<$lanes>(levels, image, weight, field, out) }
+            unsafe { sweep::<$lanes>(levels, image, weight, out) }
         }
         Sweep { run: compiled, lanes: <$lanes as Lanes>::N }
     }};
@@ -235,16 +214,14 @@ impl Sweep {
 /// p_{s+1} = (p_s − τ ∇u_s) / (1 + τ / weight · |∇u_s|)
 /// ```
 ///
-/// one row after level `s − 1`, and the last level writes `out = u`. `p_0` is 0, or `field` if that is not empty, which
-/// then receives the last dual. Each level's energy is `Σ (u_s − image)² + weight · Σ |∇u_s|`.
+/// one row after level `s − 1`, and the last level writes `out = u`. `p_0` is 0. Each level's energy is `Σ (u_s − image)² + weight · Σ |∇u_s|`.
 ///
 /// # Safety
 /// The instruction set of `L` must be there, and rows must have at least `L::N` columns.
 #[inline(always)]
-unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, field: &mut Field, out: &mut [f32]) {
+unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, out: &mut [f32]) {
     let width = levels[0].dual[0][0].len() - 1;
     let (height, last) = (image.len() / width, levels.len() - 1);
-    let warm = !field[0].is_empty();
     for level in levels.iter_mut() {
         level.energy = 0.0;
     }
@@ -257,15 +234,9 @@ unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, fiel
             let (done, rest) = levels.split_at_mut(s + 1);
             let level = &mut done[s];
             let row_of = |r: usize| r * width..(r + 1) * width;
-            if s == 0 && warm && r < height {
-                for (row, plane) in level.dual[r % 2].iter_mut().zip(field.iter()) {
-                    row[1..].copy_from_slice(&plane[row_of(r)]);
-                }
-            }
-            let is_zero = s == 0 && !warm;
             if r < height {
                 let primal = if s == last { &mut out[row_of(r)] } else { &mut level.primal[r % 2][..width] };
-                if is_zero {
+                if s == 0 {
                     primal.copy_from_slice(&image[row_of(r)]);
                 } else {
                     let above = if r > 0 { Some(&level.dual[(r - 1) % 2][0][..]) } else { None };
@@ -279,16 +250,11 @@ unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, fiel
                 let up = (r - 1) % 2;
                 let Level { dual, primal, energy } = level;
                 let below = if r < height { &primal[r % 2] } else { &primal[up] };
-                let from = if is_zero { None } else { Some(&dual[up]) };
+                let from = if s == 0 { None } else { Some(&dual[up]) };
                 let to = &mut rest[0].dual[up];
                 // SAFETY: the caller's.
                 let sum = unsafe { dual_row::<L>(&primal[up], below, &image[row_of(r - 1)], weight, from, to) };
                 *energy += f64::from(sum);
-                if warm && s + 1 == last {
-                    for (row, plane) in to.iter().zip(field.iter_mut()) {
-                        plane[row_of(r - 1)].copy_from_slice(&row[1..]);
-                    }
-                }
             }
         }
     }
@@ -473,23 +439,12 @@ mod tests {
     }
 
     #[test]
-    fn it_lowers_the_error_of_a_noisy_video_and_a_warm_dual_goes_further() {
+    fn it_lowers_the_error_of_a_noisy_video() {
         let clean = moving_square(VideoShape { frames: 3, height: 40, width: 40 }).insert_axis(Axis(1));
         let noisy = &clean + &(uniform(clean.dim(), 9) - 0.5) * 0.4;
         let error = |v: &Array4<f32>| (v - &clean).mapv(|d| d * d).sum();
-        let (mut cold, mut warm) = (Array4::zeros(clean.dim()), Array4::zeros(clean.dim()));
-        Tv::new(0.1).denoise(&CX, noisy.view(), cold.view_mut()).unwrap();
-        let mut tv = Tv::new(0.1).warm_dual(true);
-        for _ in 0..4 {
-            tv.denoise(&CX, noisy.view(), warm.view_mut()).unwrap();
-        }
-        assert!(error(&cold) < 0.5 * error(&noisy));
-        let energy = |v: &Array4<f32>| {
-            let tv = ndarray::Zip::from(v.windows((1, 1, 2, 2))).fold(0.0, |s, q| {
-                s + ((q[[0, 0, 1, 0]] - q[[0, 0, 0, 0]]).powi(2) + (q[[0, 0, 0, 1]] - q[[0, 0, 0, 0]]).powi(2)).sqrt()
-            });
-            0.5 * (v - &noisy).mapv(|d| d * d).sum() + 0.1 * tv
-        };
-        assert!(energy(&warm) < energy(&cold));
+        let mut out = Array4::zeros(clean.dim());
+        Tv::new(0.1).denoise(&CX, noisy.view(), out.view_mut()).unwrap();
+        assert!(error(&out) < 0.5 * error(&noisy));
     }
 }

@@ -24,7 +24,7 @@ pub struct Factory<'e> {
 /// A denoiser as far as it can be shared by all measurements.
 enum Part {
     /// Built anew for each measurement, as it may carry state from call to call.
-    Tv { weight: f32, inner: usize, warm_dual: bool },
+    Tv { weight: f32, inner: usize },
     /// Loaded once.
     Ffdnet(nets::Ffdnet),
 }
@@ -112,8 +112,8 @@ fn start<'a>(choice: StartChoice, previous: Option<ArrayView3<'a, f32>>) -> Star
 
 fn load(choice: &DenoiserChoice) -> anyhow::Result<Part> {
     Ok(match choice {
-        DenoiserChoice::Tv { weight, inner, warm_dual } => {
-            Part::Tv { weight: *weight, inner: *inner, warm_dual: *warm_dual }
+        DenoiserChoice::Tv { weight, inner } => {
+            Part::Tv { weight: *weight, inner: *inner }
         }
         DenoiserChoice::Ffdnet { weights } => {
             let net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
@@ -131,7 +131,7 @@ fn load(choice: &DenoiserChoice) -> anyhow::Result<Part> {
 impl Part {
     fn denoiser(&mut self) -> Box<dyn Denoiser + '_> {
         match self {
-            Self::Tv { weight, inner, warm_dual } => Box::new(Tv::new(*weight).inner(*inner).warm_dual(*warm_dual)),
+            Self::Tv { weight, inner } => Box::new(Tv::new(*weight).inner(*inner)),
             Self::Ffdnet(net) => Box::new(net),
         }
     }

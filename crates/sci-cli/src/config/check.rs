@@ -118,8 +118,6 @@ pub enum Denoiser {
         weight: f32,
         /// Dual steps a call.
         inner: usize,
-        /// Keep the dual field between calls.
-        warm_dual: bool,
     },
     /// FFDNet.
     Ffdnet {
@@ -431,7 +429,6 @@ impl<'s> Checker<'s> {
                 Ok(Denoiser::Tv {
                     weight: self.number(&format!("{key}.weight"), &k.weight, 1e-6..=100.0)?.unwrap_or(0.3) as f32,
                     inner: self.whole(&format!("{key}.inner"), &k.inner, 1..=1000)?.unwrap_or(5) as usize,
-                    warm_dual: self.flag(&format!("{key}.warm_dual"), &k.warm_dual)?.unwrap_or(false),
                 })
             }
             "ffdnet" => {

@@ -103,7 +103,6 @@ pub struct AdmmKeys {
 pub struct TvKeys {
     pub weight: Value,
     pub inner: Value,
-    pub warm_dual: Value,
 }
 
 /// `[denoiser]`, `kind = "ffdnet"`.

@@ -62,8 +62,6 @@ pub enum Denoiser {
         weight: f32,
         /// Dual steps a call.
         inner: usize,
-        /// Keep the dual field between calls.
-        warm_dual: bool,
     },
     /// FFDNet.
     Ffdnet {
@@ -159,8 +157,8 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .denoisers
         .iter()
         .map(|d| match d {
-            check::Denoiser::Tv { weight, inner, warm_dual } => {
-                Ok(Denoiser::Tv { weight: *weight, inner: *inner, warm_dual: *warm_dual })
+            check::Denoiser::Tv { weight, inner } => {
+                Ok(Denoiser::Tv { weight: *weight, inner: *inner })
             }
             check::Denoiser::Ffdnet { weights } => Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)? }),
         })
@@ -357,8 +355,8 @@ impl Experiment {
 
 fn denoiser_json(d: &Denoiser) -> Value {
     match d {
-        Denoiser::Tv { weight, inner, warm_dual } => {
-            json!({ "kind": "tv", "weight": weight, "inner": inner, "warm_dual": warm_dual })
+        Denoiser::Tv { weight, inner } => {
+            json!({ "kind": "tv", "weight": weight, "inner": inner })
         }
         Denoiser::Ffdnet { weights } => json!({ "kind": "ffdnet", "weights": weights }),
     }
