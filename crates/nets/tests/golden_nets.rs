@@ -2,7 +2,7 @@
 
 use admm::{DenoiseCx, Denoiser};
 use candle_core::{Device, Tensor};
-use ndarray::{Array0, Array4, ArrayView4};
+use ndarray::{Array0, Array4, ArrayD, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
 use nets::{Ends, Fastdvdnet, Ffdnet, Network, WeightFile};
 use std::fs::File;
@@ -28,6 +28,10 @@ impl Golden {
     }
     fn video(&mut self, name: &str) -> Array4<f32> {
         self.0.by_name(&format!("{name}.npy")).unwrap()
+    }
+    fn tensor(&mut self, name: &str) -> Tensor {
+        let array: ArrayD<f32> = self.0.by_name(&format!("{name}.npy")).unwrap();
+        Tensor::from_iter(array.iter().copied(), &Device::Cpu).unwrap().reshape(array.shape()).unwrap()
     }
     fn number(&mut self, name: &str) -> f32 {
         let value: Result<Array0<f64>, ReadNpzError> = self.0.by_name(&format!("{name}.npy"));
@@ -119,4 +123,32 @@ fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
     assert_close(live.view(), expected.view(), 1e-4);
     net.fold_batch_norm().unwrap();
     assert_close(denoise(&mut net, &noisy, sigma).view(), expected.view(), 1e-4);
+}
+
+#[test]
+fn gradients_of_the_measurement_loss_match_pytorch() {
+    let weights = shared("weights/ffdnet_gray.pth");
+    let (Some(golden), Some(weights)) = (shared("golden/online_gradient_gray.npz"), weights) else { return };
+    let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
+    let (mask, y, input) = (golden.tensor("mask"), golden.tensor("y"), golden.tensor("input"));
+    let vars = net.make_trainable().unwrap();
+    let sigma = golden.number("sigma");
+    let video = net.forward(&input, &[sigma]).unwrap().squeeze(1).unwrap();
+    let residual = ((mask * video).unwrap().sum(0).unwrap() - y).unwrap();
+    let loss = residual.sqr().unwrap().mean_all().unwrap();
+    let value = loss.to_scalar::<f32>().unwrap();
+    assert!((value / golden.number("loss") - 1.0).abs() < 1e-4, "{value}");
+    let grads = loss.backward().unwrap();
+    for (name, expected) in [
+        ("model.0.weight", "grad_first_weight"),
+        ("model.0.bias", "grad_first_bias"),
+        ("model.14.weight", "grad_middle_weight"),
+        ("model.28.weight", "grad_last_weight"),
+    ] {
+        let (_, var) = vars.iter().find(|(n, _)| n == name).unwrap();
+        let expected = golden.tensor(expected);
+        let norm = |t: &Tensor| t.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
+        let error = norm(&(grads.get(var).unwrap() - &expected).unwrap()) / norm(&expected);
+        assert!(error < 1e-3, "{name}: relative error {error:e}");
+    }
 }
