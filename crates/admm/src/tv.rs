@@ -316,15 +316,28 @@ unsafe fn dual_row<L: Lanes>(
         }
         let mut lanes = [0f32; MAX_LANES];
         energy.store(lanes.as_mut_ptr());
-        let mut sum: f32 = lanes.iter().sum();
         if whole < width {
             // The last vector reaches back over the one before; only its new columns count.
-            energy = dual_lanes([row, below, image], weight, from, to, width - L::N, L::splat(0.0));
-            energy.store(lanes.as_mut_ptr());
-            sum += lanes[L::N - (width - whole)..L::N].iter().sum::<f32>();
+            let mut tail = [0f32; MAX_LANES];
+            let x = width - L::N;
+            dual_lanes([row, below, image], weight, from, to, x, L::splat(0.0)).store(tail.as_mut_ptr());
+            lanes.iter_mut().zip(&tail).take(L::N).skip(whole - x).for_each(|(sum, v)| *sum += v);
         }
-        sum
+        sum_of(lanes)
     }
+}
+
+/// The sum of the lanes, by halves: a chain of additions would take as long as the row.
+#[inline(always)]
+fn sum_of(mut lanes: [f32; MAX_LANES]) -> f32 {
+    let mut half = MAX_LANES / 2;
+    while half > 0 {
+        for i in 0..half {
+            lanes[i] += lanes[i + half];
+        }
+        half /= 2;
+    }
+    lanes[0]
 }
 
 /// The `N` columns from `x` on of [`dual_row`], with `[row, below, image]`. Returns `energy` with theirs added.

@@ -92,7 +92,14 @@ impl Cli {
                 .build_global()
                 .context("cannot start the worker threads")?;
         }
-        match self.command {
+        // Within the pool a parallel step begins at once; from outside, each would wake a thread first.
+        rayon::scope(|_| self.command.run())
+    }
+}
+
+impl Command {
+    fn run(self) -> anyhow::Result<Done> {
+        match self {
             Command::Run(args) => args.run(),
             Command::Simulate(args) => args.run(),
             Command::Mask(args) => args.run(),
