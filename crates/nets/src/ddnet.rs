@@ -12,7 +12,7 @@
 
 use crate::fastdvdnet::{check_widths, recognise_blocks};
 use crate::layers::{Conv, Source};
-use crate::network::{Network, check_clips, copy_to, reflect, to_tensor};
+use crate::network::{Network, Padding, Window, check_clips, copy_to, reflect, to_tensor};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
@@ -148,6 +148,19 @@ impl Network for Ddnet {
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
         check_clips(self, clips, noise)?;
         Ok(self.net.forward(clips, noise)?)
+    }
+
+    /// Triplets through the first block, then triplets of its results through the second.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        self.net.stages(frames)
+    }
+
+    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor> {
+        Ok(self.net.forward_window(stage, inputs, noise)?)
+    }
+
+    fn padded(&self, clip: &Tensor) -> Result<Tensor> {
+        Ok(Padding::Reflect.pad(clip, 4)?)
     }
 
     fn convs(&self) -> Vec<&Conv> {

@@ -68,6 +68,14 @@ pub enum Error {
         /// The differences.
         keys: KeyReport,
     },
+    /// Tensors given to a network are not its own.
+    #[error("these are not the tensors of {network}: {keys}")]
+    State {
+        /// The network.
+        network: String,
+        /// The differences.
+        keys: KeyReport,
+    },
     /// A weight is NaN or infinite.
     #[error("{}: tensor {key} holds {value}: weights must be finite", path.display())]
     NotFinite {

@@ -15,7 +15,7 @@
 use crate::infer::{Cache, channel_row, set_channel};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source};
-use crate::network::{Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
+use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
 use admm::{BoxError, DenoiseCx, Denoiser};
@@ -238,6 +238,11 @@ impl Network for Ffdnet {
         }
         let image = crop(&pixel_shuffle(&z, 2)?, h, w)?;
         Ok(if residual { (clips - image)? } else { image })
+    }
+
+    /// Each frame on its own.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        vec![(0..frames).map(|t| Window { inputs: vec![t], outputs: t..t + 1 }).collect()]
     }
 
     fn convs(&self) -> Vec<&Conv> {

@@ -11,6 +11,23 @@ use std::path::Path;
 /// PyTorch's default, which all published weights were trained with.
 const BATCH_NORM_EPSILON: f64 = 1e-5;
 
+/// Which tensors of a network are trained; the statistics of batch norms never are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Parameters {
+    /// Filters, biases and the affine part of batch norms.
+    #[default]
+    All,
+    /// Biases of convolutions and of batch norms. Their gradient needs no sums over pairs of channels.
+    Biases,
+    /// All tensors of the first and the last convolution.
+    FirstLast,
+    /// All tensors of the last convolution: nothing is propagated through the layers before it.
+    Last,
+    /// Weight and bias of batch norms.
+    NormAffine,
+}
+
 /// Batch norm with frozen statistics: `γ (x − mean) / √(var + ε) + β`.
 #[derive(Debug, Clone)]
 struct BatchNorm {
@@ -78,9 +95,10 @@ impl Conv {
         self.weight.device()
     }
 
-    /// Whether the tensors are variables ([`Conv::make_trainable`]), which change behind the network's back.
+    /// Whether a tensor is a variable ([`Conv::make_trainable`]), which changes behind the network's back.
     pub(crate) fn is_variable(&self) -> bool {
-        self.weight.is_variable()
+        let norm = self.norm.iter().flat_map(|norm| [&norm.gamma, &norm.beta]);
+        [&self.weight].into_iter().chain(&self.bias).chain(norm).any(|tensor| tensor.is_variable())
     }
 
     /// Weight and bias with the batch norm folded in: `w γ/√(var+ε)`, `β − mean γ/√(var+ε)`; differentiable, so that
@@ -123,11 +141,17 @@ impl Conv {
         all
     }
 
-    /// Makes the trainable tensors variables, and returns them.
-    pub(crate) fn make_trainable(&mut self) -> candle_core::Result<Vec<(String, Var)>> {
+    /// Makes the trainable tensors variables, or those among them that `which` asks for, and returns them.
+    pub(crate) fn make_trainable(&mut self, which: Parameters) -> candle_core::Result<Vec<(String, Var)>> {
+        let affine = self.norm.as_ref().map(|norm| ["weight", "bias"].map(|key| format!("{}.{key}", norm.name)));
+        let wanted = |name: &String| match which {
+            Parameters::All | Parameters::FirstLast | Parameters::Last => true,
+            Parameters::Biases => name.ends_with(".bias"),
+            Parameters::NormAffine => affine.as_ref().is_some_and(|affine| affine.contains(name)),
+        };
         let mut vars = Vec::new();
         for (name, tensor, trainable) in self.tensors_mut() {
-            if trainable {
+            if trainable && wanted(&name) {
                 let var = Var::from_tensor(tensor)?;
                 *tensor = var.as_tensor().clone();
                 vars.push((name, var));

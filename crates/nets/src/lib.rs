@@ -33,7 +33,8 @@ pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};
 pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};
 pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
-pub use network::Network;
+pub use layers::Parameters;
+pub use network::{Network, Window};
 pub use video::Ends;
 pub use weights::WeightFile;
 

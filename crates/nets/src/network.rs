@@ -1,10 +1,20 @@
 //! What the networks have in common: named tensors, a differentiable forward pass, frames in and out.
 
-use crate::Error;
-use crate::layers::Conv;
+use crate::layers::{Conv, Parameters};
+use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
 use ndarray::{ArrayView4, ArrayViewMut4, Axis};
 use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// Frames that a stage of a network takes together: see [`Network::stages`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Window {
+    /// Which results of the stage before (of the first stage: which frames) are read, in this order.
+    pub inputs: Vec<usize>,
+    /// Which results of this stage are made.
+    pub outputs: Range<usize>,
+}
 
 /// A denoising or demosaicing network whose tensors have the names of its published implementation.
 pub trait Network: Send + Sync {
@@ -23,6 +33,33 @@ pub trait Network: Send + Sync {
     /// [`Error::Channels`], [`Error::Shape`] when `N` is not a multiple of `noise.len()` or a frame is empty,
     /// [`Error::Sigma`].
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor, Error>;
+
+    /// [`Network::forward`] of one clip taken apart, so that its gradient can be had with the memory of one window:
+    /// for each stage the windows, in the order of their outputs, for a clip of `frames` frames.
+    ///
+    /// A stage maps `[inputs, C, H, W]` to `[outputs, C, H, W]` by [`Network::forward_window`]; the first reads
+    /// [`Network::padded`] frames, the results of the last, cut back to the size of the frames, are those of `forward`.
+    /// A network that does not say otherwise is one stage of one window.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        vec![vec![Window { inputs: (0..frames).collect(), outputs: 0..frames }]]
+    }
+
+    /// One window of one stage of [`Network::stages`], differentiable in `inputs` and the trainable tensors.
+    ///
+    /// # Errors
+    /// As [`Network::forward`].
+    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor, Error> {
+        debug_assert_eq!(stage, 0);
+        self.forward(inputs, &[noise])
+    }
+
+    /// Frames `[T, C, H, W]` continued to the size that [`Network::forward_window`] takes.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    fn padded(&self, clip: &Tensor) -> Result<Tensor, Error> {
+        Ok(clip.clone())
+    }
 
     #[doc(hidden)]
     fn convs(&self) -> Vec<&Conv>;
@@ -45,11 +82,56 @@ pub trait Network: Send + Sync {
     /// # Errors
     /// When memory for the variables cannot be had.
     fn make_trainable(&mut self) -> Result<Vec<(String, Var)>, Error> {
+        self.make_some_trainable(Parameters::All)
+    }
+
+    /// [`Network::make_trainable`] of a part of the tensors. What was trainable before stays so.
+    ///
+    /// # Errors
+    /// When memory for the variables cannot be had.
+    fn make_some_trainable(&mut self, which: Parameters) -> Result<Vec<(String, Var)>, Error> {
         let mut vars = Vec::new();
-        for conv in self.convs_mut() {
-            vars.extend(conv.make_trainable()?);
+        let convs = self.convs_mut();
+        let last = convs.len().saturating_sub(1);
+        for (i, conv) in convs.into_iter().enumerate() {
+            let wanted = match which {
+                Parameters::FirstLast => i == 0 || i == last,
+                Parameters::Last => i == last,
+                _ => true,
+            };
+            if wanted {
+                vars.extend(conv.make_trainable(which)?);
+            }
         }
         Ok(vars)
+    }
+
+    /// Replaces every tensor by that of the same name in a [`Network::state`]; nothing is trainable afterwards.
+    ///
+    /// # Errors
+    /// [`Error::State`] when names or shapes are not the network's own; it is unchanged then.
+    fn set_state(&mut self, state: &BTreeMap<String, Tensor>) -> Result<(), Error> {
+        let own = self.state();
+        let mut keys = KeyReport::default();
+        for (name, tensor) in &own {
+            match state.get(name) {
+                None => keys.missing.push(name.clone()),
+                Some(new) if new.dims() != tensor.dims() => {
+                    keys.mismatched.push((name.clone(), tensor.dims().to_vec(), new.dims().to_vec()));
+                }
+                Some(_) => {}
+            }
+        }
+        keys.unexpected = state.keys().filter(|name| !own.contains_key(*name)).cloned().collect();
+        if !keys.is_empty() {
+            return Err(Error::State { network: self.describe(), keys });
+        }
+        for conv in self.convs_mut() {
+            for (name, tensor, _) in conv.tensors_mut() {
+                *tensor = state[&name].detach();
+            }
+        }
+        Ok(())
     }
 
     /// Replaces every batch norm by the equal weight and bias of the convolution before it.

@@ -8,7 +8,7 @@ use crate::Result;
 use crate::infer::{Cache, Engine, add_shuffled, channel_row, set_channel};
 use crate::kernels::{Blocked, Conv3x3};
 use crate::layers::{Conv, Shift, Source};
-use crate::network::{Padding, crop, noise_map, reflect};
+use crate::network::{Padding, Window, crop, noise_map, reflect};
 use candle_core::Tensor;
 use candle_nn::ops::pixel_shuffle;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis};
@@ -201,6 +201,18 @@ impl VideoNet {
         let y = self.stage(&self.blocks[0], &x, &windows.first, noise)?;
         let out = self.stage(&self.blocks[1], &y, &windows.second, noise)?;
         crop(&out, h, w)
+    }
+
+    /// The triplets of both stages, for [`Network::stages`](crate::Network::stages).
+    pub(crate) fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        let Windows { first, second } = Windows::new(frames, self.ends);
+        let window = |(i, triplet): (usize, [usize; 3])| Window { inputs: triplet.into(), outputs: i..i + 1 };
+        [first, second].map(|triplets| triplets.into_iter().enumerate().map(window).collect()).into()
+    }
+
+    /// One triplet `[3, C, H, W]`, `H` and `W` multiples of 4, through one stage.
+    pub(crate) fn forward_window(&self, stage: usize, triplet: &Tensor, noise: f32) -> candle_core::Result<Tensor> {
+        self.stage(&self.blocks[stage], triplet, &[[0, 1, 2]], &[noise])
     }
 
     fn stage(&self, block: &Block, x: &Tensor, triplets: &[[usize; 3]], noise: &[f32]) -> candle_core::Result<Tensor> {

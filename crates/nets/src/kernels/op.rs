@@ -178,6 +178,19 @@ impl Op {
         Tensor::from_vec(dx, (n, channels, height, width), &Device::Cpu)
     }
 
+    /// By the bias alone: sums over frames and pixels, in f64 in a fixed order.
+    fn bias_grad(grad: &Tensor) -> Result<Tensor> {
+        let (n, outputs, height, width) = grad.dims4()?;
+        let db = with_numbers(grad, |g| {
+            let plane = height * width;
+            let sum = |o: usize| -> f64 {
+                (0..n).flat_map(|i| &g[(i * outputs + o) * plane..][..plane]).map(|&v| f64::from(v)).sum()
+            };
+            Ok((0..outputs).into_par_iter().map(|o| sum(o) as f32).collect::<Vec<_>>())
+        })?;
+        Tensor::from_vec(db, outputs, &Device::Cpu)
+    }
+
     /// By weight and bias.
     fn weight_grad(&self, x: &Tensor, w: &Tensor, grad: &Tensor) -> Result<(Tensor, Tensor)> {
         let (n, channels, height, width) = x.dims4()?;
@@ -246,9 +259,11 @@ impl CustomOp3 for Op {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let grad = self.unmask(y, grad)?;
         let dx = x.track_op().then(|| self.input_grad(x, w, &grad));
-        let both = w.track_op() || b.track_op();
-        let dw = both.then(|| self.weight_grad(x, w, &grad)).transpose()?;
-        let (dw, db) = dw.unzip();
+        let (dw, db) = match (w.track_op(), b.track_op()) {
+            (true, _) => self.weight_grad(x, w, &grad).map(|(dw, db)| (Some(dw), Some(db)))?,
+            (false, true) => (None, Some(Self::bias_grad(&grad)?)),
+            (false, false) => (None, None),
+        };
         Ok((dx.transpose()?, dw, db))
     }
 }

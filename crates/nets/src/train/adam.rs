@@ -12,7 +12,7 @@ const EPSILON: f64 = 1e-8;
 ///
 /// # References
 /// Kingma, Ba, *Adam: a method for stochastic optimization*, 2015.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Adam {
     vars: Vec<Var>,
     /// First and second moments of each variable.
@@ -35,6 +35,14 @@ impl Adam {
     pub fn step(&mut self, grads: &GradStore, learning_rate: f64, clip_norm: f64) -> Result<f64> {
         let grad = |var: &Var| grads.get(var).map(|g| g.flatten_all()?.to_vec1::<f32>()).transpose();
         let grads = self.vars.iter().map(grad).collect::<candle_core::Result<Vec<_>>>()?;
+        self.apply(&grads, learning_rate, clip_norm)
+    }
+
+    /// [`Adam::step`] with gradients as plain numbers, one slice for each variable.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    pub fn apply(&mut self, grads: &[Option<Vec<f32>>], learning_rate: f64, clip_norm: f64) -> Result<f64> {
         let squares = grads.iter().flatten().flatten().map(|&g| f64::from(g) * f64::from(g));
         let norm = squares.sum::<f64>().sqrt();
         if !norm.is_finite() {
@@ -51,7 +59,7 @@ impl Adam {
             let Some(grad) = grad else { continue };
             let mut weights = var.flatten_all()?.to_vec1::<f32>()?;
             for (((w, m), v), g) in weights.iter_mut().zip(m).zip(v).zip(grad) {
-                let g = scale * g;
+                let g = scale * *g;
                 *m = b1 * *m + (1.0 - b1) * g;
                 *v = b2 * *v + (1.0 - b2) * g * g;
                 *w -= rate * *m / (v.sqrt() + epsilon);
@@ -59,6 +67,16 @@ impl Adam {
             var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
         }
         Ok(norm)
+    }
+
+    /// Goes on with the same history for other variables of the same number and sizes.
+    ///
+    /// # Panics
+    /// When they are not.
+    pub fn rebind(&mut self, vars: Vec<Var>) {
+        let sizes = |vars: &[Var]| vars.iter().map(|v| v.elem_count()).collect::<Vec<_>>();
+        assert_eq!(sizes(&vars), sizes(&self.vars), "variables of the same sizes");
+        self.vars = vars;
     }
 
     /// Steps taken.
