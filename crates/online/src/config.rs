@@ -1,0 +1,95 @@
+//! The settings of an adaptive denoiser.
+
+use crate::{Error, Result, Schedule};
+use nets::Parameters;
+
+/// How a denoiser adapts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdaptConfig {
+    /// When, and how far.
+    pub schedule: Schedule,
+    /// Which tensors change.
+    pub parameters: Parameters,
+    /// What the loss has besides the error at the sensor.
+    pub terms: Terms,
+    /// When an update is undone.
+    pub guard: Guard,
+    /// Of everything random: pixels held out, noise, flips.
+    pub seed: u64,
+}
+
+impl AdaptConfig {
+    /// The paper's code with FFDNet: all parameters, the plain loss, no guard.
+    pub const PAPER_FFDNET: Self = Self {
+        schedule: Schedule::PAPER_FFDNET,
+        parameters: Parameters::All,
+        terms: Terms::NONE,
+        guard: Guard::OFF,
+        seed: 42,
+    };
+    /// The paper's code with FastDVDnet.
+    pub const PAPER_FASTDVDNET: Self = Self { schedule: Schedule::PAPER_FASTDVDNET, ..Self::PAPER_FFDNET };
+
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for the first that is out of range.
+    pub fn validate(&self) -> Result<()> {
+        self.schedule.validate()?;
+        let Terms { pseudo_clean, distance, equivariance } = self.terms;
+        for (key, weight) in [("pseudo_clean", pseudo_clean), ("distance", distance), ("equivariance", equivariance)] {
+            if !(weight.is_finite() && weight >= 0.0) {
+                let legal = "a weight, finite and at least 0";
+                return Err(Error::Setting { key, value: weight.to_string(), legal });
+            }
+        }
+        let Guard { held_out, back_off, .. } = self.guard;
+        if !(0.0..1.0).contains(&held_out) {
+            let legal = "a share of the pixels, at least 0 and less than 1";
+            return Err(Error::Setting { key: "held_out", value: held_out.to_string(), legal });
+        }
+        if !(back_off > 0.0 && back_off <= 1.0) {
+            let legal = "greater than 0 and at most 1";
+            return Err(Error::Setting { key: "back_off", value: back_off.to_string(), legal });
+        }
+        Ok(())
+    }
+}
+
+/// Weights of the terms beside the error at the sensor, `mean (H T f(x) − y)²` with weight 1; 0 leaves a term out.
+///
+/// The measurement sees one combination of the frames; these terms speak about the rest.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Terms {
+    /// `mean (f(v + σ n) − v)²`: the output v before the update, with new noise, is to come out again (Dewil et al.,
+    /// *Self-supervised training for blind multi-frame video denoising*, 2021).
+    pub pseudo_clean: f64,
+    /// `‖w − w₀‖²`, `w₀` the pretrained weights.
+    pub distance: f64,
+    /// `mean (f(g x) − g v)²`, `g` a flip of rows, columns, both, or the order of frames, drawn for each step.
+    pub equivariance: f64,
+}
+
+impl Terms {
+    /// The plain loss.
+    pub const NONE: Self = Self { pseudo_clean: 0.0, distance: 0.0, equivariance: 0.0 };
+}
+
+/// When an update is undone. An update whose loss or output is not finite always is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Guard {
+    /// The share of the pixels of the measurement that the loss does not see. An update is kept only if the error falls
+    /// both where the loss looks and where it does not. 0: every update is kept that is finite.
+    pub held_out: f64,
+    /// After a roll-back the learning rate is multiplied by this, until the next reset.
+    pub back_off: f64,
+    /// After so many roll-backs in a row the updates of this measurement that are still due are skipped.
+    pub patience: usize,
+}
+
+impl Guard {
+    /// The paper's: none.
+    pub const OFF: Self = Self { held_out: 0.0, back_off: 1.0, patience: usize::MAX };
+    /// One pixel in ten judges; half the learning rate after a roll-back, no more tries after two.
+    pub const ON: Self = Self { held_out: 0.1, back_off: 0.5, patience: 2 };
+}

@@ -1,0 +1,272 @@
+//! The loss of an output at the sensor, and its exact gradient with the memory of one window.
+//!
+//! Written out for the whole video, `ℓ = mean (H T f(x) − y)²` needs the activations of every frame at once. But it
+//! depends on the weights through `v = f(x)` only, so two passes do: the first computes v without a graph and the
+//! residual `r = H T v − y`; the second goes through the frames again, each with its graph, propagates
+//! `∂ℓ/∂v_t = (2/N) Tᵀ (C_t ⊙ r)` and drops the graph. The gradients are summed in the order of the frames.
+//!
+//! A network of several stages (FastDVDnet) takes as many passes, the last stage first: what arrives at the results of
+//! a stage is what the stage before propagates. The memory is that of one triplet through one block, half a window of
+//! five frames, besides one video for each stage.
+
+use crate::{Error, Result};
+use candle_core::{DType, Tensor, Var};
+use ndarray::{Array2, Array4, ArrayView2, ArrayView4, Axis, Zip};
+use nets::{Network, Window};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sci_forward::bayer::{CfaPattern, mosaic_adjoint_into, mosaic_into};
+use sci_forward::{SensingOperator, VideoShape};
+use std::sync::Arc;
+
+/// A measurement and what made it: `y = H T v`, `T` the mosaic of a color sensor or the identity of a gray one.
+#[derive(Clone)]
+pub struct Snapshot {
+    operator: Arc<dyn SensingOperator>,
+    y: Array2<f32>,
+    cfa: Option<CfaPattern>,
+}
+
+impl std::fmt::Debug for Snapshot {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Snapshot")
+            .field("shape", &self.operator.shape())
+            .field("cfa", &self.cfa)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Snapshot {
+    /// Takes `y` `[H, W]`, on the scale of `Σ_t C_t`; `cfa` is the pattern of a color sensor.
+    ///
+    /// # Errors
+    /// [`Error::Size`], [`Error::NotFinite`].
+    pub fn new(operator: Arc<dyn SensingOperator>, y: ArrayView2<'_, f32>, cfa: Option<CfaPattern>) -> Result<Self> {
+        let expected = operator.shape().image_dim();
+        if y.dim() != expected {
+            let list = |(h, w)| vec![h, w];
+            return Err(Error::Size { what: "measurement", expected: list(expected), found: list(y.dim()) });
+        }
+        if let Some(((row, column), &value)) = y.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            return Err(Error::NotFinite { value, row, column });
+        }
+        Ok(Self { operator, y: y.to_owned(), cfa })
+    }
+
+    /// H.
+    pub fn operator(&self) -> &Arc<dyn SensingOperator> {
+        &self.operator
+    }
+
+    /// The measurement `[H, W]`.
+    pub fn y(&self) -> ArrayView2<'_, f32> {
+        self.y.view()
+    }
+
+    /// The pattern of a color sensor.
+    pub fn cfa(&self) -> Option<CfaPattern> {
+        self.cfa
+    }
+
+    /// Frames, rows and columns.
+    pub fn shape(&self) -> VideoShape {
+        self.operator.shape()
+    }
+
+    /// Channels of a frame of v: 3 of a color sensor, else 1.
+    pub fn channels(&self) -> usize {
+        if self.cfa.is_some() { 3 } else { 1 }
+    }
+
+    fn check(&self, what: &'static str, v: ArrayView4<'_, f32>) -> Result<()> {
+        let (t, h, w) = self.shape().dim();
+        let expected = vec![t, self.channels(), h, w];
+        let found = v.shape().to_vec();
+        if found == expected { Ok(()) } else { Err(Error::Size { what, expected, found }) }
+    }
+
+    /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`.
+    ///
+    /// # Errors
+    /// [`Error::Size`].
+    pub fn residual(&self, v: ArrayView4<'_, f32>) -> Result<Array2<f32>> {
+        self.check("video", v)?;
+        let mut r = match self.cfa {
+            None => self.operator.forward(v.index_axis_move(Axis(1), 0)),
+            Some(cfa) => {
+                let mut mosaic = ndarray::Array3::zeros(self.shape().dim());
+                mosaic_into(cfa, v, mosaic.view_mut());
+                self.operator.forward(mosaic.view())
+            }
+        };
+        r -= &self.y;
+        Ok(r)
+    }
+
+    /// `Tᵀ Hᵀ g` `[T, C, H, W]`: in frame t `C_t ⊙ g`, in the channel that the pixel sees.
+    ///
+    /// # Panics
+    /// If `g` has not the size of the measurement.
+    pub fn pull_back(&self, g: ArrayView2<'_, f32>) -> Array4<f32> {
+        let mosaic = self.operator.adjoint(g);
+        let Some(cfa) = self.cfa else { return mosaic.insert_axis(Axis(1)) };
+        let (t, h, w) = mosaic.dim();
+        let mut rgb = Array4::zeros((t, 3, h, w));
+        mosaic_adjoint_into(cfa, mosaic.view(), rgb.view_mut());
+        rgb
+    }
+}
+
+/// Which pixels of a measurement the loss sees, and which are held out to judge what it did.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pixels {
+    held_out: Array2<bool>,
+    held: usize,
+}
+
+/// The loss on the pixels of both kinds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SplitLoss {
+    /// Mean of `r²` over the pixels that the loss sees.
+    pub loss: f64,
+    /// Mean of `r²` over the pixels held out, if there are any.
+    pub held_out: Option<f64>,
+}
+
+impl SplitLoss {
+    /// Whether both are finite.
+    pub fn is_finite(&self) -> bool {
+        self.loss.is_finite() && self.held_out.is_none_or(f64::is_finite)
+    }
+}
+
+impl Pixels {
+    /// Every pixel of `[H, W]` is held out with probability `fraction`, the same for the same seed; one at least is not.
+    pub fn split((height, width): (usize, usize), fraction: f64, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut held_out = Array2::from_shape_simple_fn((height, width), || rng.random::<f64>() < fraction);
+        if held_out.iter().all(|&h| h)
+            && let Some(first) = held_out.first_mut()
+        {
+            *first = false;
+        }
+        let held = held_out.iter().filter(|&&h| h).count();
+        Self { held_out, held }
+    }
+
+    /// Of a residual `[H, W]`, summed in `f64` in row-major order.
+    ///
+    /// # Panics
+    /// If the residual has another size.
+    pub fn loss(&self, residual: ArrayView2<'_, f32>) -> SplitLoss {
+        let (mut seen, mut held) = (0f64, 0f64);
+        Zip::from(residual).and(&self.held_out).for_each(|&r, &out| {
+            let square = f64::from(r) * f64::from(r);
+            if out { held += square } else { seen += square }
+        });
+        let held_out = (self.held > 0).then(|| held / self.held as f64);
+        SplitLoss { loss: seen / (residual.len() - self.held) as f64, held_out }
+    }
+
+    /// `∂loss/∂r = (2/N) r`, 0 where held out.
+    ///
+    /// # Panics
+    /// If the residual has another size.
+    pub fn gradient(&self, residual: ArrayView2<'_, f32>) -> Array2<f32> {
+        let factor = (2.0 / (residual.len() - self.held) as f64) as f32;
+        Zip::from(residual).and(&self.held_out).map_collect(|&r, &out| if out { 0.0 } else { factor * r })
+    }
+}
+
+/// Adds to `sums` the gradient of `⟨upstream, f(input)⟩` by each of `vars`: with `upstream = ∂ℓ/∂v`, the gradient of ℓ.
+///
+/// `input` and `upstream` are `[T, C, H, W]`, `f` is `network` told `sigma`; `sums[i]` has the values of `vars[i]`.
+/// Activations are those of one window ([`Network::stages`]); windows are summed in their order.
+///
+/// # Errors
+/// [`Error::Net`] as [`Network::forward`].
+///
+/// # Panics
+/// If `sums` and `vars` do not belong together, or the videos differ in shape.
+pub fn accumulate_gradient(
+    network: &dyn Network,
+    vars: &[(String, Var)],
+    input: ArrayView4<'_, f32>,
+    sigma: f32,
+    upstream: ArrayView4<'_, f32>,
+    sums: &mut [Vec<f32>],
+) -> Result<()> {
+    assert_eq!(input.dim(), upstream.dim(), "the gradient belongs to a video of the input's shape");
+    assert_eq!(vars.len(), sums.len(), "a sum for each variable");
+    let device = network.device();
+    let tensor = |video: ArrayView4<'_, f32>| {
+        Tensor::from_vec(video.iter().copied().collect::<Vec<f32>>(), video.dim(), &device)
+    };
+    let stages = network.stages(input.len_of(Axis(0)));
+    let mut read = vec![network.padded(&tensor(input)?)?];
+    for (stage, windows) in stages.iter().enumerate().take(stages.len() - 1) {
+        let from = &read[stage];
+        let result = |window: &Window| Ok(network.forward_window(stage, &gather(from, window)?, sigma)?.detach());
+        let results = windows.iter().map(result).collect::<Result<Vec<_>>>()?;
+        read.push(Tensor::cat(&results, 0)?);
+    }
+    let (_, _, height, width) = read[0].dims4()?;
+    let (_, _, h, w) = input.dim();
+    let mut upstream = tensor(upstream)?.pad_with_zeros(2, 0, height - h)?.pad_with_zeros(3, 0, width - w)?;
+    for (stage, windows) in stages.iter().enumerate().rev() {
+        upstream = propagate(network, (stage, windows), vars, (&read[stage], sigma), &upstream, sums)?;
+        read.truncate(stage);
+    }
+    Ok(())
+}
+
+/// One stage of [`accumulate_gradient`]; returns the gradient by what the stage reads (nothing for the first).
+fn propagate(
+    network: &dyn Network,
+    (stage, windows): (usize, &[Window]),
+    vars: &[(String, Var)],
+    (read, sigma): (&Tensor, f32),
+    upstream: &Tensor,
+    sums: &mut [Vec<f32>],
+) -> Result<Tensor> {
+    let frame = read.elem_count() / read.dim(0)?;
+    let mut below = vec![0f32; if stage == 0 { 0 } else { read.elem_count() }];
+    for window in windows {
+        let mut inputs = gather(read, window)?;
+        let leaf = (stage > 0).then(|| Var::from_tensor(&inputs)).transpose()?;
+        if let Some(leaf) = &leaf {
+            inputs = leaf.as_tensor().clone();
+        }
+        let result = network.forward_window(stage, &inputs, sigma)?;
+        let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
+        let grads = (result * upstream)?.sum_all()?.backward()?;
+        for ((_, var), sum) in vars.iter().zip(&mut *sums) {
+            if let Some(grad) = grads.get(var) {
+                add(sum, &values(grad)?);
+            }
+        }
+        if let Some(grad) = leaf.as_ref().and_then(|leaf| grads.get(leaf)) {
+            for (&t, grad) in window.inputs.iter().zip(values(grad)?.chunks_exact(frame)) {
+                add(&mut below[t * frame..][..frame], grad);
+            }
+        }
+    }
+    match stage {
+        0 => Ok(Tensor::zeros(0, DType::F32, read.device())?),
+        _ => Ok(Tensor::from_vec(below, read.shape(), read.device())?),
+    }
+}
+
+fn gather(from: &Tensor, window: &Window) -> Result<Tensor> {
+    let frames = window.inputs.iter().map(|&t| from.narrow(0, t, 1)).collect::<candle_core::Result<Vec<_>>>()?;
+    Ok(Tensor::cat(&frames, 0)?)
+}
+
+fn values(tensor: &Tensor) -> Result<Vec<f32>> {
+    Ok(tensor.flatten_all()?.to_vec1()?)
+}
+
+fn add(sum: &mut [f32], terms: &[f32]) {
+    assert_eq!(sum.len(), terms.len(), "a gradient has the size of its variable");
+    sum.iter_mut().zip(terms).for_each(|(s, t)| *s += t);
+}
