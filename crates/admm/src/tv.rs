@@ -41,22 +41,58 @@ pub struct Tv {
 /// What one thread needs to denoise a plane: the steps in flight, and where strided rows are packed.
 #[derive(Debug, Clone, Default)]
 struct Scratch {
+    width: usize,
     levels: Vec<Level>,
     packed: Vec<f32>,
 }
 
 /// The two newest rows, row `r` at index `r % 2`, of the dual that a step starts from and of the primal that it makes.
-/// A row of the primal ends with its last number once more, the right neighbour of the last column; a row of the dual begins
-/// with a zero, the left neighbour of the first.
+/// A row of the primal ends with its last number once more, the right neighbour of the last column; the first number of a row
+/// of the dual has a zero before it, its left neighbour, and lies on a cache line: [`FIRST`].
 #[derive(Debug, Clone, Default)]
 struct Level {
     dual: [Rows; 2],
-    primal: [Vec<f32>; 2],
+    primal: [Row; 2],
     energy: f64,
 }
 
 /// A row of each of the two components of the dual.
-type Rows = [Vec<f32>; 2];
+type Rows = [Row; 2];
+
+/// Numbers in a cache line of 64 bytes.
+const LINE: usize = 16;
+/// The index of a dual row's first number.
+const FIRST: usize = LINE;
+
+/// A row that begins on a cache line: vectors that straddle two lines take twice as long to load and store.
+#[derive(Debug, Clone, Default)]
+struct Row(Vec<Line>);
+
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(64))]
+struct Line([f32; LINE]);
+
+impl Row {
+    /// At least so many zeros.
+    fn zeros(length: usize) -> Self {
+        Self(vec![Line::default(); length.div_ceil(LINE)])
+    }
+}
+
+impl std::ops::Deref for Row {
+    type Target = [f32];
+    fn deref(&self) -> &[f32] {
+        // SAFETY: a line is 16 floats without padding, and a vector of them is contiguous.
+        unsafe { std::slice::from_raw_parts(self.0.as_ptr().cast(), self.0.len() * LINE) }
+    }
+}
+
+impl std::ops::DerefMut for Row {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        // SAFETY: as for `deref`.
+        unsafe { std::slice::from_raw_parts_mut(self.0.as_mut_ptr().cast(), self.0.len() * LINE) }
+    }
+}
 
 impl Tv {
     /// TV of this weight.
@@ -150,15 +186,19 @@ impl Scratch {
     }
 
     fn run(&mut self, call: &Call, steps: usize, image: &[f32], out: &mut [f32]) {
-        let rows = |length| [vec![0.0; length], vec![0.0; length]];
-        let level =
-            || Level { dual: [rows(call.width + 1), rows(call.width + 1)], primal: rows(call.width + 1), energy: 0.0 };
-        if self.levels.first().is_some_and(|level| level.dual[0][0].len() != call.width + 1) {
+        let rows = |length| [Row::zeros(length), Row::zeros(length)];
+        let dual = || rows(FIRST + call.width);
+        if self.width != call.width {
             self.levels.clear();
+            self.width = call.width;
         }
-        self.levels.resize_with(steps + 1, level);
+        self.levels.resize_with(steps + 1, || Level {
+            dual: [dual(), dual()],
+            primal: rows(call.width + 1),
+            energy: 0.0,
+        });
         // SAFETY: `Sweep::available` has checked the instruction set; rows have at least a vector's width.
-        unsafe { (call.sweep.run)(&mut self.levels, image, call.weight, out) }
+        unsafe { (call.sweep.run)(&mut self.levels, image, call.width, call.weight, out) }
     }
 
     /// The number of steps after which the energy had settled, if that is less than `steps`.
@@ -171,7 +211,7 @@ impl Scratch {
 /// [`sweep`] compiled for one instruction set.
 #[derive(Debug, Clone, Copy)]
 struct Sweep {
-    run: unsafe fn(&mut [Level], &[f32], f32, &mut [f32]),
+    run: unsafe fn(&mut [Level], &[f32], usize, f32, &mut [f32]),
     /// The narrowest row that it can take.
     lanes: usize,
 }
@@ -179,9 +219,9 @@ struct Sweep {
 macro_rules! compiled {
     ($lanes:ty $(, $features:literal)?) => {{
         $(#[target_feature(enable = $features)])?
-        unsafe fn compiled(levels: &mut [Level], image: &[f32], weight: f32, out: &mut [f32]) {
+        unsafe fn compiled(levels: &mut [Level], image: &[f32], width: usize, weight: f32, out: &mut [f32]) {
             // SAFETY: the caller's; the features are those of the vector.
-            unsafe { sweep::<$lanes>(levels, image, weight, out) }
+            unsafe { sweep::<$lanes>(levels, image, width, weight, out) }
         }
         Sweep { run: compiled, lanes: <$lanes as Lanes>::N }
     }};
@@ -219,8 +259,7 @@ impl Sweep {
 /// # Safety
 /// The instruction set of `L` must be there, and rows must have at least `L::N` columns.
 #[inline(always)]
-unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, out: &mut [f32]) {
-    let width = levels[0].dual[0][0].len() - 1;
+unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], width: usize, weight: f32, out: &mut [f32]) {
     let (height, last) = (image.len() / width, levels.len() - 1);
     for level in levels.iter_mut() {
         level.energy = 0.0;
@@ -267,21 +306,21 @@ unsafe fn sweep<L: Lanes>(levels: &mut [Level], image: &[f32], weight: f32, out:
 #[inline(always)]
 unsafe fn primal_row<L: Lanes>(image: &[f32], [p0, p1]: &Rows, above: Option<&[f32]>, out: &mut [f32]) {
     let width = image.len();
-    let dual_width = width + 1;
-    assert!(out.len() == width && p0.len() == dual_width && p1.len() == dual_width && width >= L::N);
-    assert!(above.is_none_or(|p| p.len() == dual_width));
+    let end = FIRST + width;
+    assert!(out.len() == width && p0.len() >= end && p1.len() >= end && width >= L::N);
+    assert!(above.is_none_or(|p| p.len() >= end));
     let mut x = 0;
     while x < width {
         // The last vector reaches back over the one before if the width asks for it, and makes the same again.
         x = x.min(width - L::N);
-        // SAFETY: `x + N ≤ width`, and rows of the dual are one longer; the instruction set is the caller's.
+        // SAFETY: `x + N ≤ width`, and rows of the dual reach to `FIRST + width`; the instruction set is the caller's.
         unsafe {
-            let mut sum = L::load(image.as_ptr().add(x)).sub(L::load(p0.as_ptr().add(x + 1)));
-            sum = sum.sub(L::load(p1.as_ptr().add(x + 1)));
+            let mut sum = L::load(image.as_ptr().add(x)).sub(L::load(p0.as_ptr().add(FIRST + x)));
+            sum = sum.sub(L::load(p1.as_ptr().add(FIRST + x)));
             if let Some(above) = above {
-                sum = sum.add(L::load(above.as_ptr().add(x + 1)));
+                sum = sum.add(L::load(above.as_ptr().add(FIRST + x)));
             }
-            sum.add(L::load(p1.as_ptr().add(x))).store(out.as_mut_ptr().add(x));
+            sum.add(L::load(p1.as_ptr().add(FIRST + x - 1))).store(out.as_mut_ptr().add(x));
         }
         x += L::N;
     }
@@ -302,10 +341,11 @@ unsafe fn dual_row<L: Lanes>(
     to: &mut Rows,
 ) -> f32 {
     let width = image.len();
-    let longer = width + 1;
-    assert!(row.len() == longer && below.len() == longer && to.iter().all(|p| p.len() == longer) && width >= L::N);
-    assert!(from.is_none_or(|p| p.iter().all(|p| p.len() == longer)));
-    // SAFETY: `x + N ≤ width` for every vector, and all rows but the image's are one longer. The instruction set is the caller's.
+    let end = FIRST + width;
+    assert!(row.len() > width && below.len() > width && to.iter().all(|p| p.len() >= end) && width >= L::N);
+    assert!(from.is_none_or(|p| p.iter().all(|p| p.len() >= end)));
+    // SAFETY: `x + N ≤ width` for every vector, rows of the primal are longer than that, those of the dual
+    // reach to `FIRST + width`. The instruction set is the caller's.
     unsafe {
         let mut energy = L::splat(0.0);
         let whole = width / L::N * L::N;
@@ -353,7 +393,7 @@ unsafe fn dual_lanes<L: Lanes>(
     x: usize,
     energy: L,
 ) -> L {
-    // SAFETY: the caller's; the primal has a column more at its end, and the dual one at its beginning.
+    // SAFETY: the caller's; the primal has a column more at its end, the dual begins at `FIRST`.
     unsafe {
         let u = L::load(row.as_ptr().add(x));
         let g0 = L::load(below.as_ptr().add(x)).sub(u);
@@ -363,12 +403,12 @@ unsafe fn dual_lanes<L: Lanes>(
         let shrink = norm.mul_add(L::splat(TAU / weight), L::splat(1.0)).recip();
         let (mut p0, mut p1) = (L::splat(0.0), L::splat(0.0));
         if let Some([from0, from1]) = from {
-            p0 = L::load(from0.as_ptr().add(x + 1));
-            p1 = L::load(from1.as_ptr().add(x + 1));
+            p0 = L::load(from0.as_ptr().add(FIRST + x));
+            p1 = L::load(from1.as_ptr().add(FIRST + x));
         }
         let tau = L::splat(TAU);
-        tau.neg_mul_add(g0, p0).mul(shrink).store(to0.as_mut_ptr().add(x + 1));
-        tau.neg_mul_add(g1, p1).mul(shrink).store(to1.as_mut_ptr().add(x + 1));
+        tau.neg_mul_add(g0, p0).mul(shrink).store(to0.as_mut_ptr().add(FIRST + x));
+        tau.neg_mul_add(g1, p1).mul(shrink).store(to1.as_mut_ptr().add(FIRST + x));
         d.mul_add(d, norm.mul_add(L::splat(weight), energy))
     }
 }
