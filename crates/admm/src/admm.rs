@@ -2,7 +2,7 @@
 
 use crate::{BoxError, DenoiseCx, Denoiser, Problem, Solver};
 use ndarray::{Array3, ArrayView3, ArrayView4, Axis, Zip};
-use sci_forward::DataStep;
+use sci_forward::{DataStep, Progress};
 
 /// ADMM for `min ½‖y − H x‖² + λ g(θ)` subject to `x = θ`, scaled dual `b`:
 ///
@@ -55,20 +55,20 @@ impl<D: Denoiser> Solver for Admm<D> {
         AdmmState { x: zeros.clone(), b: zeros.clone(), previous: zeros, theta: start }
     }
 
-    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut AdmmState) -> Result<(), BoxError> {
+    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut AdmmState) -> Result<Progress, BoxError> {
         let AdmmState { x, theta, previous, b } = state;
         std::mem::swap(previous, theta);
         // θ is overwritten at the end of the step; until then its place holds p = θ + b.
         let p = theta;
         Zip::from(&mut *p).and(&*previous).and(&*b).par_for_each(|p, &theta, &b| *p = theta + b);
-        let step = DataStep { y: problem.y(), damping: self.gamma, momentum: None };
+        let step = DataStep { damping: self.gamma, ..DataStep::projection(problem.y()) };
         problem.operator().data_step(step, p.view(), x.view_mut());
         // x is only needed as x − b from here on: θ is denoised from it, and b ← b − (x − θ) = θ − (x − b).
         Zip::from(&mut *x).and(&*b).par_for_each(|x, &b| *x -= b);
         let theta = p;
         self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), theta.view_mut().insert_axis(Axis(1)))?;
         Zip::from(b).and(&*theta).and(&*x).par_for_each(|b, &theta, &x| *b = theta - x);
-        Ok(())
+        Ok(problem.operator().progress(problem.y(), theta.view(), previous.view()))
     }
 
     fn estimate<'s>(&self, state: &'s AdmmState) -> ArrayView3<'s, f32> {

@@ -2,7 +2,7 @@
 
 use crate::{BoxError, DenoiseCx, Denoiser, Problem, Solver};
 use ndarray::{Array2, Array3, ArrayView3, ArrayView4, Axis};
-use sci_forward::DataStep;
+use sci_forward::{DataStep, Progress};
 
 /// Where the accumulated measurement `y1` of accelerated GAP starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,7 +51,7 @@ impl<D: Denoiser> Gap<D> {
 /// The iterates of [`Gap`].
 #[derive(Debug)]
 pub struct GapState {
-    /// The projection x `[T, H, W]`.
+    /// The projection x `[T, H, W]` of v, the denoiser's next input.
     x: Array3<f32>,
     /// The denoised v `[T, H, W]`.
     v: Array3<f32>,
@@ -59,6 +59,16 @@ pub struct GapState {
     previous: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
     y1: Option<Array2<f32>>,
+}
+
+impl GapState {
+    /// The x of the next iteration from the v of this one. It reads v once for the projection and for how far v has come.
+    fn project(&mut self, problem: &Problem<'_>) -> Progress {
+        let Self { x, v, previous, y1 } = self;
+        let previous = Some(previous.view());
+        let step = DataStep { momentum: y1.as_mut(), previous, ..DataStep::projection(problem.y()) };
+        problem.operator().data_step(step, v.view(), x.view_mut())
+    }
 }
 
 impl<D: Denoiser> Solver for Gap<D> {
@@ -74,15 +84,16 @@ impl<D: Denoiser> Solver for Gap<D> {
             MomentumStart::Measurement => problem.y().to_owned(),
         });
         let zeros = Array3::zeros(start.dim());
-        GapState { x: zeros.clone(), previous: zeros, v: start, y1 }
+        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1 };
+        state.project(problem);
+        state
     }
 
-    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<(), BoxError> {
-        let GapState { x, v, previous, y1 } = state;
+    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<Progress, BoxError> {
+        let GapState { x, v, previous, .. } = state;
         std::mem::swap(previous, v);
-        let step = DataStep { y: problem.y(), damping: 0.0, momentum: y1.as_mut() };
-        problem.operator().data_step(step, previous.view(), x.view_mut());
-        self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), v.view_mut().insert_axis(Axis(1)))
+        self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), v.view_mut().insert_axis(Axis(1)))?;
+        Ok(state.project(problem))
     }
 
     fn estimate<'s>(&self, state: &'s GapState) -> ArrayView3<'s, f32> {

@@ -109,7 +109,7 @@ fn admm_tv(problem: &Problem<'_>, iterations: usize, mut tv: impl Denoiser) -> R
     let (mut p, mut x) = (b.clone(), theta.clone());
     for iteration in 0..iterations {
         Zip::from(&mut p).and(&theta).and(&b).par_for_each(|p, &theta, &b| *p = theta + b);
-        let step = DataStep { y: problem.y, damping: 0.01, momentum: None };
+        let step = DataStep { damping: 0.01, ..DataStep::projection(problem.y) };
         problem.operator.data_step(step, p.view(), x.view_mut());
         Zip::from(&mut p).and(&x).and(&b).par_for_each(|z, &x, &b| *z = x - b);
         let cx = DenoiseCx { sigma: 0.0, iteration, stage: 0 };

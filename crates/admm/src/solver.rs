@@ -76,11 +76,11 @@ pub trait Solver {
     /// The state before the first iteration, from a video `[T, H, W]`.
     fn init(&mut self, problem: &Problem<'_>, start: Array3<f32>) -> Self::State;
 
-    /// One iteration.
+    /// One iteration. Returns how far the new estimate is from the measurement and from the estimate before.
     ///
     /// # Errors
     /// What the denoiser reports.
-    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut Self::State) -> Result<(), BoxError>;
+    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut Self::State) -> Result<Progress, BoxError>;
 
     /// The estimate where the sensor sees it: gray or mosaic video `[T, H, W]`.
     fn estimate<'s>(&self, state: &'s Self::State) -> ArrayView3<'s, f32>;
@@ -139,13 +139,12 @@ pub fn run<S: Solver>(
             clock.resume();
             let iteration = iterations;
             let cx = DenoiseCx { sigma, iteration, stage };
-            solver.step(problem, &cx, &mut state).map_err(|source| {
+            let progress = solver.step(problem, &cx, &mut state).map_err(|source| {
                 let name = solver.denoiser_name().to_owned();
                 SolveError::Denoiser { name, iteration, source }
             })?;
             iterations += 1;
             let estimate = solver.estimate(&state);
-            let progress = problem.operator().progress(problem.y(), estimate, solver.previous(&state));
             let rgb = solver.rgb(&state);
             clock.pause();
 

@@ -3,8 +3,8 @@
 use crate::prior::clip;
 use crate::{BoxError, DenoiseCx, Denoiser, Problem, Solver};
 use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Zip};
-use sci_forward::DataStep;
 use sci_forward::bayer::{CfaPattern, Demosaicer, mosaic_into};
+use sci_forward::{DataStep, Progress};
 
 /// How the dual variables are kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -173,14 +173,15 @@ impl<D: Denoiser, M: Demosaicer> Solver for TwoStage<D, M> {
         }
     }
 
-    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut TwoStageState) -> Result<(), BoxError> {
+    fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut TwoStageState) -> Result<Progress, BoxError> {
         let first = cx.iteration == 0;
         let (b_scale, w_scale) = self.dual_scales();
         let TwoStageState { theta, tx, q, b, mosaic, .. } = state;
         let link = tx.as_ref().unwrap_or(theta);
         Zip::from(&mut *mosaic).and(link).and(&*b).par_for_each(|p, &link, &b| *p = link - b / b_scale);
         let damping = self.params.alpha * self.params.rho;
-        problem.operator().data_step(DataStep { y: problem.y(), damping, momentum: None }, mosaic.view(), q.view_mut());
+        let step = DataStep { damping, ..DataStep::projection(problem.y()) };
+        problem.operator().data_step(step, mosaic.view(), q.view_mut());
         Zip::from(&mut *mosaic).and(&*q).and(&*b).par_for_each(|m, &q, &b| *m = q + b / b_scale);
 
         match self.x_step {
@@ -214,7 +215,7 @@ impl<D: Denoiser, M: Demosaicer> Solver for TwoStage<D, M> {
                 *b += q - *theta;
             }),
         }
-        Ok(())
+        Ok(problem.operator().progress(problem.y(), state.theta.view(), state.previous.view()))
     }
 
     fn estimate<'s>(&self, state: &'s TwoStageState) -> ArrayView3<'s, f32> {

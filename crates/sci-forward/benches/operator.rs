@@ -24,13 +24,7 @@ fn operator(c: &mut Criterion) {
         group.bench_function("adjoint", |b| b.iter(|| operator.adjoint_into(measured.view(), copy.view_mut())));
         group.throughput(Throughput::Bytes(3 * video + 2 * image));
         group.bench_function("projection", |b| {
-            b.iter(|| {
-                operator.data_step(
-                    DataStep { y: measured.view(), damping: 0.0, momentum: None },
-                    x.view(),
-                    copy.view_mut(),
-                )
-            })
+            b.iter(|| operator.data_step(DataStep::projection(measured.view()), x.view(), copy.view_mut()))
         });
         let previous = x.clone();
         group.bench_function("progress", |b| b.iter(|| operator.progress(measured.view(), x.view(), previous.view())));
@@ -38,7 +32,7 @@ fn operator(c: &mut Criterion) {
         group.bench_function("accelerated projection", |b| {
             b.iter(|| {
                 operator.data_step(
-                    DataStep { y: measured.view(), damping: 0.0, momentum: Some(&mut y1) },
+                    DataStep { momentum: Some(&mut y1), ..DataStep::projection(measured.view()) },
                     x.view(),
                     copy.view_mut(),
                 )

@@ -43,14 +43,14 @@ pub trait SensingOperator: Send + Sync {
     fn gram_diag(&self) -> ArrayView2<'_, f32>;
 
     /// Moves `from` `[T, H, W]` towards the measurement in closed form and writes the result to `to`, see [`DataStep`].
-    /// Returns `‖y − H from‖²`.
+    /// Returns how far `from` is from the measurement and from [`DataStep::previous`].
     ///
     /// # Panics
     /// If a size differs from [`SensingOperator::shape`].
-    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> f64 {
-        let DataStep { y, damping, momentum } = step;
+    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> Progress {
+        let DataStep { y, damping, momentum, previous } = step;
+        let progress = self.progress(y, from, previous.unwrap_or(from));
         let mut hx = self.forward(from);
-        let residual = Zip::from(y).and(&hx).fold(0.0, |sum, &y, &hx| sum + f64::from(y - hx).powi(2));
         match momentum {
             Some(y1) => Zip::from(&mut hx).and(y).and(y1).for_each(|hx, &y, y1| {
                 *y1 += y - *hx;
@@ -61,7 +61,7 @@ pub trait SensingOperator: Send + Sync {
         hx.zip_mut_with(&self.gram_diag(), |c, &gram| *c = if gram > CLOSED { *c / (gram + damping) } else { 0.0 });
         self.adjoint_into(hx.view(), to.view_mut());
         to += &from;
-        residual
+        progress
     }
 
     /// How far an iterate `x` `[T, H, W]` is from the measurement and from the iterate before it.
@@ -121,6 +121,15 @@ pub struct DataStep<'a> {
     pub damping: f32,
     /// The accumulated measurement `y1` `[H, W]` of accelerated GAP, in row-major order, updated in place.
     pub momentum: Option<&'a mut Array2<f32>>,
+    /// The iterate before `from`, `[T, H, W]`, if its change is wanted.
+    pub previous: Option<ArrayView3<'a, f32>>,
+}
+
+impl<'a> DataStep<'a> {
+    /// The undamped projection onto `{x : H x = y}`.
+    pub fn projection(y: ArrayView2<'a, f32>) -> Self {
+        Self { y, damping: 0.0, momentum: None, previous: None }
+    }
 }
 
 /// `H` of coded-exposure video: `y = Σ_t C_t ⊙ x_t`, `diag(H Hᵀ) = Σ_t C_t²`.
@@ -134,7 +143,7 @@ pub struct DataStep<'a> {
 /// let y = h.forward(Array3::from_elem(shape.dim(), 0.7).view());
 /// let start = Array3::zeros(shape.dim());
 /// let mut x = start.clone();
-/// h.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, start.view(), x.view_mut());
+/// h.data_step(DataStep::projection(y.view()), start.view(), x.view_mut());
 /// assert!((h.forward(x.view()) - y).iter().all(|d| d.abs() < 1e-5)); // projected: H x = y
 /// # Ok::<(), sci_forward::MaskError>(())
 /// ```
@@ -197,10 +206,12 @@ impl SensingOperator for MaskOperator {
         self.gram.view()
     }
 
-    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> f64 {
-        let DataStep { y, damping, momentum } = step;
+    fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> Progress {
+        let DataStep { y, damping, momentum, previous } = step;
+        let previous = previous.unwrap_or(from);
         self.check(from.dim(), y.dim());
         self.check(to.dim(), y.dim());
+        self.check(previous.dim(), y.dim());
         let width = y.ncols();
         let momentum: Vec<Option<&mut [f32]>> = match momentum {
             Some(y1) => {
@@ -210,26 +221,28 @@ impl SensingOperator for MaskOperator {
             }
             None => (0..y.nrows().div_ceil(BAND)).map(|_| None).collect(),
         };
-        let residuals: Vec<f64> = to
+        let bands: Vec<Progress> = to
             .axis_chunks_iter_mut(Axis(1), BAND)
             .into_par_iter()
             .zip(from.axis_chunks_iter(Axis(1), BAND))
+            .zip(previous.axis_chunks_iter(Axis(1), BAND))
             .zip(self.masks.view().axis_chunks_iter(Axis(1), BAND))
             .zip(self.gram.axis_chunks_iter(Axis(0), BAND))
             .zip(y.axis_chunks_iter(Axis(0), BAND))
             .zip(momentum)
-            .map(|(((((mut to, from), c), gram), y), mut y1)| {
+            .map(|((((((mut to, from), previous), c), gram), y), mut y1)| {
                 let mut local = Local::new(from.dim().0);
                 let rows = 0..y.nrows();
-                rows.fold(0.0, |residual, row| {
+                rows.fold(Progress::default(), |sum, row| {
                     let target = Target { gram: gram.row(row), y: y.row(row), damping };
                     let y1 = y1.as_mut().map(|y1| &mut y1[row * width..][..width]);
                     let to = to.index_axis_mut(Axis(1), row);
-                    residual + data_step_row(rows_at(c, row), rows_at(from, row), to, target, y1, &mut local)
+                    let video = [rows_at(from, row), rows_at(previous, row)];
+                    sum.plus(data_step_row(rows_at(c, row), video, to, target, y1, &mut local))
                 })
             })
             .collect();
-        residuals.iter().sum()
+        bands.into_iter().fold(Progress::default(), Progress::plus)
     }
 
     fn progress(&self, y: ArrayView2<'_, f32>, x: ArrayView3<'_, f32>, previous: ArrayView3<'_, f32>) -> Progress {
@@ -304,27 +317,31 @@ fn add_product(sum: &mut [f32], a: &[f32], b: &[f32]) {
     }
 }
 
-/// [`SensingOperator::data_step`] of one row; `c`, `from` and `to` are `[T, W]`.
+/// [`SensingOperator::data_step`] of one row; `c`, `from`, `previous` and `to` are `[T, W]`.
 fn data_step_row(
     c: ArrayView2<'_, f32>,
-    from: ArrayView2<'_, f32>,
+    [from, previous]: [ArrayView2<'_, f32>; 2],
     mut to: ArrayViewMut2<'_, f32>,
     target: Target<'_>,
     mut y1: Option<&mut [f32]>,
     local: &mut Local,
-) -> f64 {
+) -> Progress {
     let (_, width) = from.dim();
     let (gram, y) = (packed(target.gram), packed(target.y));
     let mut coefficients = [0f32; CHUNK];
     let mut residual = 0.0;
+    let mut norms = Norms::default();
     for start in (0..width).step_by(CHUNK) {
         let columns = start..(start + CHUNK).min(width);
         let count = columns.len();
         let coefficients = &mut coefficients[..count];
         coefficients.fill(0.0);
-        for (t, (x, c)) in from.outer_iter().zip(c.outer_iter()).enumerate() {
-            let local = (&mut local.video[t * count..][..count], &mut local.masks[t * count..][..count]);
-            add_product_and_keep(coefficients, &packed(c)[columns.clone()], &packed(x)[columns.clone()], local);
+        for (t, ((x, previous), c)) in from.outer_iter().zip(previous.outer_iter()).zip(c.outer_iter()).enumerate() {
+            let (x, previous, c) = (packed(x), packed(previous), packed(c));
+            let (x, c) = (&x[columns.clone()], &c[columns.clone()]);
+            local.video[t * count..][..count].copy_from_slice(x);
+            local.masks[t * count..][..count].copy_from_slice(c);
+            add_progress(coefficients, c, x, &previous[columns.clone()], &mut norms);
         }
         let (y, gram) = (&y[columns.clone()], &gram[columns.clone()]);
         residual += match &mut y1 {
@@ -342,16 +359,7 @@ fn data_step_row(
             }
         }
     }
-    residual
-}
-
-/// Adds `c x` to `sum`, and copies `x` and `c` to `kept`.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn add_product_and_keep(sum: &mut [f32], c: &[f32], x: &[f32], kept: (&mut [f32], &mut [f32])) {
-    for ((((sum, c), x), kept_x), kept_c) in sum.iter_mut().zip(c).zip(x).zip(kept.0).zip(kept.1) {
-        *sum += c * x;
-        (*kept_x, *kept_c) = (*x, *c);
-    }
+    norms.progress(residual)
 }
 
 /// `to = x + c v`.
@@ -416,41 +424,46 @@ fn progress_row(
     hx: &mut [f32],
 ) -> Progress {
     hx.fill(0.0);
-    let (mut change, mut norm) = ([0f32; LANES], [0f32; LANES]);
+    let mut norms = Norms::default();
     for ((c, x), previous) in c.outer_iter().zip(x.outer_iter()).zip(previous.outer_iter()) {
-        add_progress(hx, &packed(c), &packed(x), &packed(previous), &mut change, &mut norm);
+        add_progress(hx, &packed(c), &packed(x), &packed(previous), &mut norms);
     }
-    let residual = squared_distance(hx, &packed(y));
-    let sum = |lanes: [f32; LANES]| lanes.iter().map(|&v| f64::from(v)).sum();
-    Progress { residual, change: sum(change), norm: sum(norm) }
+    norms.progress(squared_distance(hx, &packed(y)))
 }
 
-/// Adds `c x` to `hx`, `(x − previous)²` to `change` and `x²` to `norm`, all in one reading of `x`.
+/// Sums of `(x − previous)²` and of `x²` over lanes.
+#[derive(Default)]
+struct Norms {
+    change: [f32; LANES],
+    norm: [f32; LANES],
+}
+
+impl Norms {
+    fn progress(&self, residual: f64) -> Progress {
+        let sum = |lanes: &[f32; LANES]| lanes.iter().map(|&v| f64::from(v)).sum();
+        Progress { residual, change: sum(&self.change), norm: sum(&self.norm) }
+    }
+}
+
+/// Adds `c x` to `hx`, and to the norms, all in one reading of `x`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn add_progress(
-    hx: &mut [f32],
-    c: &[f32],
-    x: &[f32],
-    previous: &[f32],
-    change: &mut [f32; LANES],
-    norm: &mut [f32; LANES],
-) {
+fn add_progress(hx: &mut [f32], c: &[f32], x: &[f32], previous: &[f32], norms: &mut Norms) {
     let ((hx, hx_rest), (c, c_rest)) = (hx.as_chunks_mut::<LANES>(), c.as_chunks::<LANES>());
     let ((x, x_rest), (previous, previous_rest)) = (x.as_chunks::<LANES>(), previous.as_chunks::<LANES>());
-    let (mut changes, mut norms) = (*change, *norm);
+    let Norms { mut change, mut norm } = *norms;
     for (((hx, c), x), previous) in hx.iter_mut().zip(c).zip(x).zip(previous) {
         for lane in 0..LANES {
             hx[lane] += c[lane] * x[lane];
-            changes[lane] += (x[lane] - previous[lane]) * (x[lane] - previous[lane]);
-            norms[lane] += x[lane] * x[lane];
+            change[lane] += (x[lane] - previous[lane]) * (x[lane] - previous[lane]);
+            norm[lane] += x[lane] * x[lane];
         }
     }
     for (lane, (((hx, c), x), previous)) in hx_rest.iter_mut().zip(c_rest).zip(x_rest).zip(previous_rest).enumerate() {
         *hx += c * x;
-        changes[lane] += (x - previous) * (x - previous);
-        norms[lane] += x * x;
+        change[lane] += (x - previous) * (x - previous);
+        norm[lane] += x * x;
     }
-    (*change, *norm) = (changes, norms);
+    *norms = Norms { change, norm };
 }
 
 #[cfg(test)]
@@ -511,23 +524,27 @@ mod tests {
                 fast.adjoint_into(y.view(), out.view_mut());
                 prop_assert_eq!(&out, &naive.adjoint(y.view()));
 
+                let previous = uniform(shape.dim(), seed + 2);
+                let close = |a: Progress, b: Progress| {
+                    [(a.residual, b.residual), (a.change, b.change), (a.norm, b.norm)]
+                        .iter()
+                        .all(|(a, b)| (a - b).abs() <= 1e-5 * b)
+                };
                 for accelerated in [false, true] {
                     let run = |operator: &dyn SensingOperator| {
                         let (mut to, mut y1) = (x.mapv(|_| f32::NAN), y.mapv(|v| v * 0.5));
                         let momentum = accelerated.then_some(&mut y1);
-                        let residual = operator.data_step(DataStep { y: y.view(), damping, momentum }, x.view(), to.view_mut());
-                        (to, y1, residual)
+                        let step = DataStep { y: y.view(), damping, momentum, previous: Some(previous.view()) };
+                        let progress = operator.data_step(step, x.view(), to.view_mut());
+                        (to, y1, progress)
                     };
-                    let ((x, y1, residual), (nx, ny1, nresidual)) = (run(&fast), run(&naive));
-                    prop_assert_eq!(x, nx);
-                    prop_assert_eq!(y1, ny1);
-                    prop_assert!((residual - nresidual).abs() <= 1e-5 * nresidual);
+                    let ((to, y1, progress), (naive_to, naive_y1, naive_progress)) = (run(&fast), run(&naive));
+                    prop_assert_eq!(to, naive_to);
+                    prop_assert_eq!(y1, naive_y1);
+                    prop_assert!(close(progress, naive_progress), "{progress:?} {naive_progress:?}");
                 }
-                let previous = uniform(shape.dim(), seed + 2);
-                let (fast, naive) = (fast.progress(y.view(), x.view(), previous.view()), naive.progress(y.view(), x.view(), previous.view()));
-                for (a, b) in [(fast.residual, naive.residual), (fast.change, naive.change), (fast.norm, naive.norm)] {
-                    prop_assert!((a - b).abs() <= 1e-5 * b, "{a} {b}");
-                }
+                let progress = |h: &dyn SensingOperator| h.progress(y.view(), x.view(), previous.view());
+                prop_assert!(close(progress(&fast), progress(&naive)));
             }
         }
 
@@ -538,7 +555,7 @@ mod tests {
                 let before = uniform(shape.dim(), seed);
                 let mut x = before.clone();
                 let y = operator.forward(uniform(shape.dim(), seed + 1).view());
-                operator.data_step(DataStep { y: y.view(), damping: 0.0, momentum: None }, before.view(), x.view_mut());
+                operator.data_step(DataStep::projection(y.view()), before.view(), x.view_mut());
                 let hx = operator.forward(x.view());
                 for ((i, j), &gram) in operator.gram_diag().indexed_iter() {
                     if gram > CLOSED {
@@ -562,7 +579,7 @@ mod tests {
         let y = gaussian(shape.image_dim(), 2);
         let mut a = wide.clone();
         let mut b = packed.clone();
-        let step = || DataStep { y: y.view(), damping: 0.1, momentum: None };
+        let step = || DataStep { damping: 0.1, ..DataStep::projection(y.view()) };
         operator.data_step(step(), strided, a.slice_mut(ndarray::s![.., ..;2, 1..;2]));
         operator.data_step(step(), packed.view(), b.view_mut());
         assert_eq!(operator.progress(y.view(), strided, strided), operator.progress(y.view(), packed.view(), strided));
@@ -579,10 +596,11 @@ mod tests {
             let mut x = from.clone();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
-                let step = DataStep { y: y.view(), damping: 0.0, momentum: None };
-                let residual = operator.data_step(step, from.view(), x.view_mut());
-                let progress = operator.progress(y.view(), x.view(), from.view());
-                (x, [residual, progress.residual, progress.change, progress.norm].map(f64::to_bits))
+                let step = DataStep::projection(y.view());
+                let before = operator.data_step(step, from.view(), x.view_mut());
+                let after = operator.progress(y.view(), x.view(), from.view());
+                let bits = |p: Progress| [p.residual, p.change, p.norm].map(f64::to_bits);
+                (x, bits(before), bits(after))
             })
         };
         assert_eq!(run(1), run(2));
