@@ -25,11 +25,13 @@ struct Settings {
     sequence: SequenceConfig,
     stages: Vec<Stage>,
     measurements: usize,
+    /// GAP without momentum.
+    plain: bool,
 }
 
 fn set(settings: &mut Settings, key: &str, value: &str) -> Result<(), Box<dyn Error>> {
-    let Settings { adapt, sequence, stages, measurements } = settings;
-    let AdaptConfig { schedule, parameters, terms, guard, seed } = adapt;
+    let Settings { adapt, sequence, stages, measurements, plain } = settings;
+    let AdaptConfig { schedule, parameters, terms, guard, blind, seed } = adapt;
     match key {
         "first" => schedule.first = value.parse()?,
         "interval" => schedule.interval = value.parse()?,
@@ -55,6 +57,8 @@ fn set(settings: &mut Settings, key: &str, value: &str) -> Result<(), Box<dyn Er
         "held_out" => guard.held_out = value.parse()?,
         "back_off" => guard.back_off = value.parse()?,
         "patience" => guard.patience = value.parse()?,
+        "blind" => *blind = Some(value.parse()?),
+        "plain" => *plain = value.parse()?,
         "seed" => *seed = value.parse()?,
         "carry_over" => sequence.reuse = if value.parse()? { Reuse::CarryOver } else { Reuse::Reset },
         "unchanged" => sequence.similarity.unchanged = value.parse()?,
@@ -89,6 +93,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         sequence: SequenceConfig::default(),
         stages: [50.0, 25.0, 12.0, 6.0].map(|s: f32| Stage { sigma: s / 255.0, iterations: 5 }).to_vec(),
         measurements: usize::MAX,
+        plain: false,
     };
     for argument in arguments {
         let (key, value) = argument.split_once('=').ok_or("settings are written key=value")?;
@@ -114,7 +119,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let snapshots = snapshots.collect::<Result<Vec<_>, _>>()?;
         results.push(run_sequence(&mut denoiser, snapshots, config, |denoiser, task| {
             let problem = Problem::new(task.snapshot.operator().as_ref(), task.snapshot.y())?;
-            let mut solver = Gap::accelerated(denoiser);
+            let mut solver = if settings.plain { Gap::plain(denoiser) } else { Gap::accelerated(denoiser) };
             run(&mut solver, &problem, task.start(Start::Mean), &task.plan(&plan), &mut ())
         })?);
     }

@@ -112,7 +112,11 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
             return Err(Error::Channels { network: self.net.describe(), sensor, expected, found });
         }
         let Self { config, .. } = self;
-        let pixels = Pixels::split(snapshot.shape().image_dim(), config.guard.held_out, config.seed);
+        let (size, held_out) = (snapshot.shape().image_dim(), config.guard.held_out);
+        let pixels = match config.blind {
+            None => Pixels::split(size, held_out, config.seed),
+            Some(seen) => Pixels::blind(size, held_out, seen, config.seed),
+        };
         self.bound = Some(Bound { snapshot, pixels });
         (self.measurements, self.since_reset) = (self.measurements + 1, self.since_reset + 1);
         (self.fired, self.refused) = (0, 0);
@@ -196,55 +200,55 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
             self.updates.push(record);
             return Ok(());
         }
-        let before = bound.pixels.loss(bound.snapshot.residual(out.view())?.view());
+        // What the loss looks at: the output itself, or that for the blinded input.
+        let blinded = bound.pixels.blinded(noisy);
+        let input = blinded.as_ref().map_or(noisy, |blinded| blinded.view());
+        let looked_at = blinded.as_ref().map(|blinded| self.denoised(cx, blinded.view())).transpose()?;
+        let seen = looked_at.as_ref().map_or(out.view(), |v| v.view());
+        let before = bound.pixels.loss(bound.snapshot.residual(seen)?.view());
         // Variables are copies: what is trained leaves these as they are.
         let (weights, optimizer) = (self.net.state(), self.optimizer.clone());
-        let trial = match self.trial(bound, (cx, record.learning_rate), noisy, out.view()) {
-            Ok(trial) => trial,
-            Err(error) => {
-                (self.optimizer, _) = (optimizer, self.net.set_state(&weights)?);
-                return Err(error);
+        let tried = self.trial(bound, (cx, record.learning_rate), input, seen, out.view());
+        let outcome = tried.and_then(|tried| {
+            let Some((v, after)) = tried else { return Ok(Err(RollBack::NotFinite)) };
+            record = record.with(before, Some(after));
+            if let Some(reason) = objection(before, after) {
+                return Ok(Err(reason));
             }
-        };
-        record = record.with(before, trial.as_ref().map(|(_, after)| *after));
-        record.outcome = match trial {
-            None => Outcome::RolledBack(RollBack::NotFinite),
-            Some((_, after)) if !after.is_finite() => Outcome::RolledBack(RollBack::NotFinite),
-            Some((v, after)) => match self.objection(before, after) {
-                Some(reason) => Outcome::RolledBack(reason),
-                None => {
-                    out.assign(&v);
-                    Outcome::Kept
-                }
-            },
-        };
-        if let Outcome::RolledBack(_) = record.outcome {
-            (self.optimizer, _) = (optimizer, self.net.set_state(&weights)?);
-            self.rate *= self.config.guard.back_off;
-            self.refused += 1;
-        } else {
-            self.refused = 0;
+            let v = if blinded.is_some() { self.denoised(cx, noisy)? } else { v };
+            Ok(if v.iter().all(|v| v.is_finite()) { Ok(v) } else { Err(RollBack::NotFinite) })
+        });
+        record = if record.loss_before.is_none() { record.with(before, None) } else { record };
+        let restored = !matches!(outcome, Ok(Ok(_)));
+        if restored {
+            self.optimizer = optimizer;
+            self.net.set_state(&weights)?;
+        }
+        match outcome? {
+            Ok(v) => {
+                out.assign(&v);
+                self.refused = 0;
+                record.outcome = Outcome::Kept;
+            }
+            Err(reason) => {
+                self.rate *= self.config.guard.back_off;
+                self.refused += 1;
+                record.outcome = Outcome::RolledBack(reason);
+            }
         }
         self.updates.push(record);
         Ok(())
     }
 
-    fn objection(&self, before: SplitLoss, after: SplitLoss) -> Option<RollBack> {
-        let (Some(held_before), Some(held_after)) = (before.held_out, after.held_out) else { return None };
-        if held_after >= held_before {
-            Some(RollBack::HeldOut)
-        } else {
-            (after.loss >= before.loss).then_some(RollBack::Loss)
-        }
-    }
-
-    /// Trains, and denoises again. Nothing when a number was not finite.
+    /// Trains, and denoises `input` again; nothing when a number was not finite. `before` is the output for `input`,
+    /// `target` the output of the iteration so far.
     fn trial(
         &mut self,
         bound: &Bound,
         (cx, learning_rate): (&DenoiseCx, f64),
-        noisy: ArrayView4<'_, f32>,
-        out: ArrayView4<'_, f32>,
+        input: ArrayView4<'_, f32>,
+        before: ArrayView4<'_, f32>,
+        target: ArrayView4<'_, f32>,
     ) -> Result<Option<(Array4<f32>, SplitLoss)>> {
         let vars = self.net.make_some_trainable(self.config.parameters)?;
         let trained = vars.iter().map(|(_, var)| var.clone()).collect();
@@ -258,10 +262,11 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         };
         let mut rng = self.rng(cx.iteration);
         let std = self.config.schedule.input_noise;
-        let input = if std > 0.0 { renoised(noisy, std, &mut rng) } else { noisy.to_owned() };
+        let noisier = (std > 0.0).then(|| renoised(input, std, &mut rng));
+        let train_on = noisier.as_ref().map_or(input, |noisier| noisier.view());
         for step in 0..self.config.schedule.steps {
-            let known = (step == 0 && std == 0.0).then_some(out);
-            let grads = self.gradient(bound, cx, &vars, input.view(), known, out, &mut rng)?;
+            let known = (step == 0 && std == 0.0).then_some(before);
+            let grads = self.gradient(bound, cx, &vars, train_on, known, target, &mut rng)?;
             let grads: Vec<_> = grads.into_iter().map(Some).collect();
             if !adam.apply(&grads, learning_rate, f64::INFINITY)?.is_finite() {
                 return Ok(None);
@@ -270,9 +275,9 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         self.optimizer = self.config.schedule.keep_optimizer.then_some(adam);
         // Constants again, which inference packs once instead of for every frame.
         self.net.set_state(&self.net.state())?;
-        let v = self.denoised(cx, noisy)?;
+        let v = self.denoised(cx, input)?;
         let after = bound.pixels.loss(bound.snapshot.residual(v.view())?.view());
-        Ok(v.iter().all(|v| v.is_finite()).then_some((v, after)))
+        Ok(after.is_finite().then_some((v, after)))
     }
 
     /// The gradient of the loss with all its terms by each of `vars`. `known` is the output for `input`, if it is known;
@@ -338,6 +343,17 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         let mut v = Array4::zeros(noisy.dim());
         self.net.denoise(cx, noisy, v.view_mut()).map_err(Error::Denoiser)?;
         Ok(v)
+    }
+}
+
+/// Why an update is to be undone, unless nothing is held out to judge it.
+fn objection(before: SplitLoss, after: SplitLoss) -> Option<RollBack> {
+    let (Some(held_before), Some(held_after)) = (before.held_out, after.held_out) else { return None };
+    // Nothing compares with a NaN: what was not finite before is not worth keeping either.
+    if !(held_after < held_before) {
+        Some(RollBack::HeldOut)
+    } else {
+        (!(after.loss < before.loss)).then_some(RollBack::Loss)
     }
 }
 

@@ -14,6 +14,10 @@ pub struct AdaptConfig {
     pub terms: Terms,
     /// When an update is undone.
     pub guard: Guard,
+    /// The share of the pixels that the loss sees, taken out of the network's input for it together with the pixels held
+    /// out ([`Pixels::blinded`](crate::Pixels::blinded)). Nothing: the paper's loss, which sees all that are not held
+    /// out, with an input that holds them.
+    pub blind: Option<f64>,
     /// Of everything random: pixels held out, noise, flips.
     pub seed: u64,
 }
@@ -25,6 +29,7 @@ impl AdaptConfig {
         parameters: Parameters::All,
         terms: Terms::NONE,
         guard: Guard::OFF,
+        blind: None,
         seed: 42,
     };
     /// The paper's code with FastDVDnet.
@@ -47,6 +52,10 @@ impl AdaptConfig {
         if !(0.0..1.0).contains(&held_out) {
             let legal = "a share of the pixels, at least 0 and less than 1";
             return Err(Error::Setting { key: "held_out", value: held_out.to_string(), legal });
+        }
+        if let Some(seen) = self.blind.filter(|seen| !(*seen > 0.0 && seen + held_out <= 0.9)) {
+            let legal = "greater than 0, and at most 0.9 together with held_out: what is left are the neighbours";
+            return Err(Error::Setting { key: "blind", value: seen.to_string(), legal });
         }
         if !(back_off > 0.0 && back_off <= 1.0) {
             let legal = "greater than 0 and at most 1";

@@ -117,11 +117,24 @@ impl Snapshot {
     }
 }
 
+/// What a pixel of a measurement is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    /// The loss sees it.
+    Seen,
+    /// It judges what the loss did.
+    HeldOut,
+    /// Neither.
+    Neighbour,
+}
+
 /// Which pixels of a measurement the loss sees, and which are held out to judge what it did.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Pixels {
-    held_out: Array2<bool>,
+    roles: Array2<Role>,
+    seen: usize,
     held: usize,
+    blind: bool,
 }
 
 /// The loss on the pixels of both kinds.
@@ -141,17 +154,62 @@ impl SplitLoss {
 }
 
 impl Pixels {
-    /// Every pixel of `[H, W]` is held out with probability `fraction`, the same for the same seed; one at least is not.
-    pub fn split((height, width): (usize, usize), fraction: f64, seed: u64) -> Self {
+    /// Every pixel of `[H, W]` is held out with probability `held_out`, the same for the same seed; the loss sees the
+    /// others, at least one.
+    pub fn split(size: (usize, usize), held_out: f64, seed: u64) -> Self {
+        Self::draw(size, held_out, None, seed)
+    }
+
+    /// Every pixel is held out with probability `held_out` and seen by the loss with probability `seen`, at least one;
+    /// [`Pixels::blinded`] takes both out of the input.
+    pub fn blind(size: (usize, usize), held_out: f64, seen: f64, seed: u64) -> Self {
+        Self::draw(size, held_out, Some(seen), seed)
+    }
+
+    fn draw((height, width): (usize, usize), held_out: f64, seen: Option<f64>, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut held_out = Array2::from_shape_simple_fn((height, width), || rng.random::<f64>() < fraction);
-        if held_out.iter().all(|&h| h)
-            && let Some(first) = held_out.first_mut()
+        let mut roles = Array2::from_shape_simple_fn((height, width), || match rng.random::<f64>() {
+            u if u < held_out => Role::HeldOut,
+            u if seen.is_some_and(|seen| u >= held_out + seen) => Role::Neighbour,
+            _ => Role::Seen,
+        });
+        let count = |roles: &Array2<Role>, role| roles.iter().filter(|&&r| r == role).count();
+        if count(&roles, Role::Seen) == 0
+            && let Some(first) = roles.first_mut()
         {
-            *first = false;
+            *first = Role::Seen;
         }
-        let held = held_out.iter().filter(|&&h| h).count();
-        Self { held_out, held }
+        Self { seen: count(&roles, Role::Seen), held: count(&roles, Role::HeldOut), roles, blind: seen.is_some() }
+    }
+
+    /// The input `[T, C, H, W]` of a network without what it says about the pixels that the loss looks at or that are
+    /// held out: each is the mean of the others among its eight neighbours. Nothing unless made by [`Pixels::blind`].
+    ///
+    /// The input of a denoiser has been projected onto the measurement, so that it holds every pixel of it, those held
+    /// out too; a network that denoises less then has a smaller error everywhere. What it makes of a pixel that it does
+    /// not see is a fair judge (Batson, Royer, *Noise2Self*, 2019).
+    ///
+    /// # Panics
+    /// If the video has not the size of the measurement.
+    pub fn blinded(&self, video: ArrayView4<'_, f32>) -> Option<Array4<f32>> {
+        let (.., height, width) = video.dim();
+        assert_eq!((height, width), self.roles.dim(), "the video must have the measurement's size");
+        let mut blinded = self.blind.then(|| video.to_owned())?;
+        let hidden = self.roles.indexed_iter().filter(|(_, role)| **role != Role::Neighbour);
+        for ((i, j), _) in hidden {
+            let around = |at: usize, n: usize| at.saturating_sub(1)..(at + 2).min(n);
+            let pairs = around(i, height).flat_map(|i| around(j, width).map(move |j| (i, j)));
+            let others: Vec<_> = pairs.filter(|&at| self.roles[at] == Role::Neighbour).collect();
+            if others.is_empty() {
+                continue;
+            }
+            for (mut out, frame) in blinded.outer_iter_mut().zip(video.outer_iter()) {
+                for (mut out, plane) in out.outer_iter_mut().zip(frame.outer_iter()) {
+                    out[[i, j]] = others.iter().map(|&at| plane[at]).sum::<f32>() / others.len() as f32;
+                }
+            }
+        }
+        Some(blinded)
     }
 
     /// Of a residual `[H, W]`, summed in `f64` in row-major order.
@@ -160,21 +218,26 @@ impl Pixels {
     /// If the residual has another size.
     pub fn loss(&self, residual: ArrayView2<'_, f32>) -> SplitLoss {
         let (mut seen, mut held) = (0f64, 0f64);
-        Zip::from(residual).and(&self.held_out).for_each(|&r, &out| {
+        Zip::from(residual).and(&self.roles).for_each(|&r, role| {
             let square = f64::from(r) * f64::from(r);
-            if out { held += square } else { seen += square }
+            match role {
+                Role::Seen => seen += square,
+                Role::HeldOut => held += square,
+                Role::Neighbour => {}
+            }
         });
         let held_out = (self.held > 0).then(|| held / self.held as f64);
-        SplitLoss { loss: seen / (residual.len() - self.held) as f64, held_out }
+        SplitLoss { loss: seen / self.seen as f64, held_out }
     }
 
-    /// `∂loss/∂r = (2/N) r`, 0 where held out.
+    /// `∂loss/∂r = (2/N) r` at the `N` pixels that the loss sees, else 0.
     ///
     /// # Panics
     /// If the residual has another size.
     pub fn gradient(&self, residual: ArrayView2<'_, f32>) -> Array2<f32> {
-        let factor = (2.0 / (residual.len() - self.held) as f64) as f32;
-        Zip::from(residual).and(&self.held_out).map_collect(|&r, &out| if out { 0.0 } else { factor * r })
+        let factor = (2.0 / self.seen as f64) as f32;
+        let of = |&r: &f32, &role: &Role| if role == Role::Seen { factor * r } else { 0.0 };
+        Zip::from(residual).and(&self.roles).map_collect(of)
     }
 }
 
