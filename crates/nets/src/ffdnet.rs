@@ -4,7 +4,7 @@
 //! z = [unshuffle(x), σ] → conv + ReLU → … → conv → shuffle
 //! ```
 //!
-//! Two layouts are published. The authors' own (and the one trained here) has biases, the map last, and gives the clean
+//! Two layouts are published. The authors' own has biases, the map last, and gives the clean
 //! image. The other (Tassano's port, which the reference gray pipeline uses) has batch norm, the map first, and gives
 //! the noise.
 //!

@@ -176,8 +176,9 @@ fn ddnet_learns_one_clip() {
 
 #[test]
 fn training_beats_doing_nothing_on_held_out_frames() {
-    let mut config = config(FFDNET, 1, 500);
-    config.training.learning_rate = 1e-2;
+    let mut config = config(NetworkConfig::Ffdnet { channels: 1, width: 16, depth: 4 }, 1, 500);
+    config.training.learning_rate = 5e-3;
+    config.data.batch = 8;
     let mut trainer = trainer(&config);
     let untrained = trainer.validate().unwrap()[0].psnr_db;
     run(&mut trainer, 500);

@@ -34,7 +34,8 @@ pub struct TrainConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum NetworkConfig {
-    /// [`Ffdnet`](crate::Ffdnet), direct layout.
+    /// [`Ffdnet`](crate::Ffdnet), residual layout without batch norm: what is learned is the noise, so that training begins
+    /// near the identity instead of having to find it first.
     Ffdnet {
         /// 1 gray, 3 RGB.
         channels: usize,
@@ -73,7 +74,7 @@ impl NetworkConfig {
     }
 
     pub(super) fn ffdnet(channels: usize, width: usize, depth: usize) -> FfdnetSpec {
-        FfdnetSpec { channels, width, depth, layout: FfdnetLayout::Direct }
+        FfdnetSpec { channels, width, depth, layout: FfdnetLayout::Residual { batch_norm: false } }
     }
 
     pub(super) fn fastdvdnet(channels: usize, widths: [usize; 3]) -> FastdvdnetSpec {
