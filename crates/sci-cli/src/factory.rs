@@ -1,24 +1,35 @@
 //! Owns the step from a resolved experiment to objects that run: networks loaded once, solvers built for each measurement.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
+use std::path::Path;
 use std::rc::Rc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use admm::{
-    Admm, BoxError, DenoiseCx, Denoiser, Gap, MomentumStart, Observer, Outcome, PerStage, Plan, Problem, SolveError,
-    Start, StopRule, Tv,
+    Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Gap, MomentumStart, Observer, Outcome, PerLattice, PerStage,
+    Plan, Problem, SolveError, Start, StopRule, Tv, TwoStage,
 };
 use anyhow::Context;
-use ndarray::{ArrayView3, ArrayView4, ArrayViewMut4};
+use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
+use nets::Network;
+use sci_forward::bayer::{Bilinear, Malvar, Menon};
+use sci_forward::{CfaPattern, Demosaicer};
 
 use crate::config::check::{Momentum, Solver, Start as StartChoice};
-use crate::config::resolve::{Denoiser as DenoiserChoice, Experiment};
+use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment};
 
 /// Builds the solvers of one experiment.
 pub struct Factory<'e> {
     experiment: &'e Experiment,
     parts: Vec<Part>,
+    color: Option<Sensor>,
     plan: Plan,
+}
+
+/// A color sensor, and what demosaics it.
+struct Sensor {
+    cfa: CfaPattern,
+    demosaicer: SharedDemosaicer,
 }
 
 /// A denoiser as far as it can be shared by all measurements.
@@ -27,15 +38,26 @@ enum Part {
     Tv { weight: f32, inner: usize },
     /// Loaded once.
     Ffdnet(nets::Ffdnet),
+    /// Loaded once.
+    Fastdvdnet(nets::Fastdvdnet),
 }
 
 impl<'e> Factory<'e> {
-    /// Loads what the experiment names.
+    /// Loads what the experiment names, for scenes of a sensor with the pattern `cfa`, `None` for a gray one.
     ///
     /// # Errors
-    /// A weight file that cannot be read or does not fit its network.
-    pub fn new(experiment: &'e Experiment) -> anyhow::Result<Self> {
-        let parts = experiment.denoisers.iter().map(load).collect::<anyhow::Result<_>>()?;
+    /// A weight file that cannot be read or does not fit its network; a gray network or solver for a color scene, or the
+    /// reverse.
+    pub fn new(experiment: &'e Experiment, cfa: Option<CfaPattern>) -> anyhow::Result<Self> {
+        if cfa.is_none() {
+            let gray = "the scene is gray; name its Bayer pattern in data.cfa if it is a mosaic";
+            let two_stage = matches!(experiment.solver, Solver::TwoStage { .. });
+            anyhow::ensure!(!two_stage, "solver.kind = \"two-stage\" is for color sensors: {gray}");
+            anyhow::ensure!(experiment.demosaicer.is_none(), "solver.demosaicer has no effect: {gray}");
+        }
+        let parts = experiment.denoisers.iter().map(|d| load(d, cfa)).collect::<anyhow::Result<_>>()?;
+        let sensor = |cfa| anyhow::Ok(Sensor { cfa, demosaicer: demosaicer(experiment)? });
+        let color = cfa.map(sensor).transpose()?;
         let stages: Vec<admm::Stage> =
             experiment.stages.iter().map(|s| admm::Stage { sigma: s.sigma, iterations: s.iterations }).collect();
         let mut plan = Plan::new(stages);
@@ -44,7 +66,7 @@ impl<'e> Factory<'e> {
             time: experiment.seconds.map(Duration::from_secs_f64),
             ..StopRule::default()
         };
-        Ok(Self { experiment, parts, plan })
+        Ok(Self { experiment, parts, color, plan })
     }
 
     /// The stages and the stop rule.
@@ -63,12 +85,15 @@ impl<'e> Factory<'e> {
         observer: &mut dyn Observer,
     ) -> Result<Solved, SolveError> {
         let calls = Rc::new(Cell::new(0));
-        let of_stage = self.experiment.stages.iter().map(|s| s.denoiser).collect();
-        let denoisers = self.parts.iter_mut().map(|p| p.denoiser()).collect();
-        let denoiser = Counted { inner: PerStage::new(denoisers, of_stage), calls: Rc::clone(&calls) };
-        let start = start(self.experiment.start, previous);
-        let mut solved = match self.experiment.solver {
-            Solver::Gap { momentum } => {
+        let color = self.color.as_ref();
+        let denoiser = Counted { inner: denoiser(self.experiment, &mut self.parts, color), calls: Rc::clone(&calls) };
+        let start = start(self.experiment.start, color.is_some(), previous);
+        let mut outcome = match (self.experiment.solver, color) {
+            (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
+                let mut solver = TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params);
+                without_state(admm::run(&mut solver, problem, start, &self.plan, observer)?)
+            }
+            (Solver::Gap { momentum }, _) => {
                 let mut gap = match momentum {
                     None => Gap::plain(denoiser),
                     Some(Momentum::Zero) => Gap::with_momentum(denoiser, MomentumStart::Zero),
@@ -76,14 +101,56 @@ impl<'e> Factory<'e> {
                 };
                 without_state(admm::run(&mut gap, problem, start, &self.plan, observer)?)
             }
-            Solver::Admm { gamma } => {
+            (Solver::Admm { gamma }, _) => {
                 let mut solver = Admm::new(denoiser, gamma);
                 without_state(admm::run(&mut solver, problem, start, &self.plan, observer)?)
             }
+            (Solver::TwoStage { .. }, None) => unreachable!("Factory::new refuses two-stage solvers for gray scenes"),
         };
-        solved.denoiser_calls = calls.get();
-        Ok(solved)
+        if let Some(sensor) = color {
+            sensor.complete(&mut outcome)?;
+        }
+        Ok(Solved { outcome, denoiser_calls: calls.get() })
     }
+}
+
+impl Sensor {
+    /// Sees to the RGB video where the solver has none of its own: after a prior on the mosaic, a divergence, or no
+    /// iteration at all.
+    fn complete(&self, outcome: &mut Outcome<()>) -> Result<(), SolveError> {
+        if outcome.rgb.is_some() && outcome.iterations > 0 {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        let (frames, height, width) = outcome.estimate.dim();
+        let mut rgb = Array4::zeros((frames, 3, height, width));
+        self.demosaicer.clone().demosaic(self.cfa, outcome.estimate.view(), rgb.view_mut()).map_err(|source| {
+            SolveError::Denoiser { name: "demosaicer".into(), iteration: outcome.iterations, source }
+        })?;
+        outcome.rgb = Some(rgb);
+        outcome.seconds += begin.elapsed().as_secs_f64();
+        Ok(())
+    }
+}
+
+/// The prior of a solve: on gray or, for the two-stage solver, RGB video as it is; else on the mosaic.
+fn denoiser<'p>(experiment: &Experiment, parts: &'p mut [Part], color: Option<&Sensor>) -> PerStage<'p> {
+    let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
+    let denoisers = parts.iter_mut().map(|part| match (part, on_mosaic) {
+        (Part::Tv { weight, inner }, sensor) => {
+            let tv = Tv::new(*weight).inner(*inner);
+            if sensor.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) }
+        }
+        (Part::Ffdnet(net), None) => boxed(net),
+        (Part::Fastdvdnet(net), None) => boxed(net),
+        (Part::Ffdnet(net), Some(s)) => boxed(Demosaicked::new(net, s.demosaicer.clone(), s.cfa)),
+        (Part::Fastdvdnet(net), Some(s)) => boxed(Demosaicked::new(net, s.demosaicer.clone(), s.cfa)),
+    });
+    PerStage::new(denoisers.collect(), experiment.stages.iter().map(|s| s.denoiser).collect())
+}
+
+fn boxed<'a>(denoiser: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
+    Box::new(denoiser)
 }
 
 /// The outcome of one measurement, whatever the solver.
@@ -95,45 +162,70 @@ pub struct Solved {
     pub denoiser_calls: usize,
 }
 
-fn without_state<S>(o: Outcome<S>) -> Solved {
+fn without_state<S>(o: Outcome<S>) -> Outcome<()> {
     let Outcome { estimate, rgb, stop, iterations, seconds, relative_residual, .. } = o;
-    let outcome = Outcome { state: (), estimate, rgb, stop, iterations, seconds, relative_residual };
-    Solved { outcome, denoiser_calls: 0 }
+    Outcome { state: (), estimate, rgb, stop, iterations, seconds, relative_residual }
 }
 
-fn start<'a>(choice: StartChoice, previous: Option<ArrayView3<'a, f32>>) -> Start<'a> {
+fn start<'a>(choice: StartChoice, bayer: bool, previous: Option<ArrayView3<'a, f32>>) -> Start<'a> {
     match (choice, previous) {
         (StartChoice::Adjoint, _) => Start::Adjoint,
-        (StartChoice::Tv { iterations, weight }, _) => Start::Tv { iterations, weight },
+        (StartChoice::Tv { iterations, weight }, _) => Start::Tv { iterations, weight, bayer },
         (StartChoice::Previous, Some(x)) => Start::From(x),
         (StartChoice::Mean | StartChoice::Previous, _) => Start::Mean,
     }
 }
 
-fn load(choice: &DenoiserChoice) -> anyhow::Result<Part> {
+fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>) -> anyhow::Result<Part> {
+    let fits = |net: &dyn Network, weights: &Path| {
+        let (channels, (scene, needed)) = (net.channels(), if cfa.is_some() { ("color", 3) } else { ("gray", 1) });
+        anyhow::ensure!(
+            channels == needed,
+            "denoiser.weights: {}: a network for {channels} channels, but the scene is {scene}: it needs one for {needed}",
+            weights.display()
+        );
+        Ok(())
+    };
     Ok(match choice {
-        DenoiserChoice::Tv { weight, inner } => {
-            Part::Tv { weight: *weight, inner: *inner }
-        }
+        DenoiserChoice::Tv { weight, inner } => Part::Tv { weight: *weight, inner: *inner },
         DenoiserChoice::Ffdnet { weights } => {
             let net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
-            let channels = net.spec().channels;
-            anyhow::ensure!(
-                channels == 1,
-                "denoiser.weights: {}: a network for {channels} channels, but the scene is gray: it needs one for 1",
-                weights.display()
-            );
+            fits(&net, weights)?;
             Part::Ffdnet(net)
+        }
+        DenoiserChoice::Fastdvdnet { weights, ends } => {
+            let net = nets::Fastdvdnet::load(weights, *ends).context("denoiser.weights")?;
+            fits(&net, weights)?;
+            Part::Fastdvdnet(net)
         }
     })
 }
 
-impl Part {
-    fn denoiser(&mut self) -> Box<dyn Denoiser + '_> {
-        match self {
-            Self::Tv { weight, inner } => Box::new(Tv::new(*weight).inner(*inner)),
-            Self::Ffdnet(net) => Box::new(net),
+/// The demosaicer of an experiment; by default that of the reference code: Malvar's for two stages, Menon's else.
+fn demosaicer(experiment: &Experiment) -> anyhow::Result<SharedDemosaicer> {
+    let demosaicer: Box<dyn Demosaicer> = match (&experiment.demosaicer, experiment.solver) {
+        (Some(DemosaicerChoice::Bilinear), _) => Box::new(Bilinear),
+        (Some(DemosaicerChoice::Malvar), _) | (None, Solver::TwoStage { .. }) => Box::new(Malvar),
+        (Some(DemosaicerChoice::Menon), _) | (None, _) => Box::new(Menon),
+        (Some(DemosaicerChoice::Ddnet { weights }), _) => {
+            Box::new(nets::Ddnet::load(weights, nets::Ends::Circular).context("solver.weights")?)
         }
+    };
+    Ok(SharedDemosaicer(Rc::new(RefCell::new(demosaicer))))
+}
+
+/// One demosaicer for all denoisers of a schedule, as a network is too large to have twice.
+#[derive(Clone)]
+struct SharedDemosaicer(Rc<RefCell<Box<dyn Demosaicer>>>);
+
+impl Demosaicer for SharedDemosaicer {
+    fn demosaic(
+        &mut self,
+        cfa: CfaPattern,
+        mosaic: ArrayView3<'_, f32>,
+        rgb: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        self.0.borrow_mut().demosaic(cfa, mosaic, rgb)
     }
 }
 
@@ -156,5 +248,9 @@ impl<D: Denoiser> Denoiser for Counted<D> {
     ) -> Result<(), BoxError> {
         self.calls.set(self.calls.get() + 1);
         self.inner.denoise(cx, noisy, out)
+    }
+
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        self.inner.rgb()
     }
 }

@@ -1,9 +1,8 @@
 //! Owns simulation for `sci simulate` and `data.kind = "simulate"`: masks over a video, then the noise of a sensor.
 
-use ndarray::Array3;
-use sci_forward::{MaskStack, Noise};
+use sci_forward::{CfaPattern, MaskStack, Noise};
 
-use crate::io::scene::{Keys, Scene, SceneError};
+use crate::io::scene::{Keys, Scene, SceneError, Truth};
 
 /// The noise of a simulated sensor: shot noise first, then read noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,7 +27,7 @@ pub enum SimulateError {
     Noise(#[from] sci_forward::NoiseError),
 }
 
-/// Measures `truth` `[T, H, W]` through `masks`, T / B times.
+/// Measures the T frames of `truth` through `masks`, T / B times; by a color sensor if it is in color or `cfa` is given.
 ///
 /// # Errors
 /// [`SimulateError`] if sizes differ, there are too few frames, or the noise is out of range.
@@ -36,10 +35,11 @@ pub fn simulate(
     file: &str,
     keys: &Keys,
     masks: MaskStack,
-    truth: Array3<f32>,
+    truth: Truth,
+    cfa: Option<CfaPattern>,
     noise: &NoiseModel,
 ) -> Result<Scene, SimulateError> {
-    let mut scene = Scene::new(file, keys, masks.view().to_owned(), None, Some(truth))?;
+    let mut scene = Scene::new(file, keys, masks.view().to_owned(), None, Some(truth), cfa)?;
     for (k, mut y) in scene.measurements.outer_iter_mut().enumerate() {
         // Two draws a measurement, each from a seed of its own.
         let seed = |part: u64| noise.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(2 * k as u64 + part);
@@ -58,16 +58,18 @@ pub fn simulate(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::Array3;
     use sci_forward::VideoShape;
 
     #[test]
     fn noise_is_seeded_and_differs_between_measurements() {
         let shape = VideoShape { frames: 2, height: 8, width: 8 };
         let masks = MaskStack::random(shape, 0.5, 1).unwrap();
-        let truth = Array3::from_elem((4, 8, 8), 0.5);
+        let truth = Truth::Sensor(Array3::from_elem((4, 8, 8), 0.5));
         let noise = NoiseModel { sigma: 0.1, photons: Some(100.0), seed: 3 };
-        let make =
-            |n: &NoiseModel| simulate("v", &Keys::default(), masks.clone(), truth.clone(), n).unwrap().measurements;
+        let make = |n: &NoiseModel| {
+            simulate("v", &Keys::default(), masks.clone(), truth.clone(), None, n).unwrap().measurements
+        };
         let (a, b) = (make(&noise), make(&noise));
         assert_eq!(a, b);
         assert_ne!(a.index_axis(ndarray::Axis(0), 0), a.index_axis(ndarray::Axis(0), 1));

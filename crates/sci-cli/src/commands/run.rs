@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use admm::{BoxError, IterInfo, Observer, Plan, Problem, StopReason};
 use anyhow::Context;
-use ndarray::{Array3, ArrayView3, Axis};
+use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Axis};
 use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
 use sci_forward::{SensingOperator, VideoShape};
 
@@ -14,7 +14,7 @@ use crate::config::resolve::{Experiment, MaskSource, OutputFormat, Simulate};
 use crate::config::{self};
 use crate::factory::{Factory, Solved};
 use crate::io::output::{ArrayFormat, Part, Staging, write_arrays, write_frames, write_preview};
-use crate::io::scene::{self, Scene};
+use crate::io::scene::{self, Scene, Truth};
 use crate::progress::Progress;
 use crate::record::{MeanRecord, MeasurementRecord, Record, SCHEMA, Skipped, Trace, host};
 use crate::report::{self, MeasurementImages};
@@ -45,7 +45,7 @@ impl Args {
         let scene = read_scene(&experiment).context("data.path")?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
         let chosen = choose(&experiment, &scene)?;
-        let mut factory = Factory::new(&experiment)?;
+        let mut factory = Factory::new(&experiment, scene.cfa)?;
         // A folder that cannot be written should not be found out after hours of solving.
         drop(Staging::new(&out)?);
         announce(&experiment, &scene, chosen.len());
@@ -61,11 +61,16 @@ impl Args {
 fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
     let data = &experiment.data;
     let Some(s) = &data.simulate else { return Ok(scene::read(&data.path, &data.reading)?) };
-    let truth = scene::read_gray_video(&data.path, &data.reading)?;
-    let (_, height, width) = truth.dim();
+    let video = match data.reading.cfa {
+        None => scene::read_gray_video(&data.path, &data.reading)?.insert_axis(Axis(1)),
+        Some(_) => scene::read_video(&data.path, &data.reading)?,
+    };
+    let (_, channels, height, width) = video.dim();
+    // A single channel of a color sensor is its mosaic.
+    let truth = if channels == 3 { Truth::Rgb(video) } else { Truth::Sensor(video.index_axis_move(Axis(1), 0)) };
     let masks = masks(s, &data.reading, height, width)?;
     let noise = NoiseModel { sigma: s.sigma, photons: s.photons, seed: s.seed };
-    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, &noise)?)
+    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, data.reading.cfa, &noise)?)
 }
 
 fn masks(
@@ -112,7 +117,20 @@ fn announce(experiment: &Experiment, scene: &Scene, count: usize) {
 /// One solved measurement.
 struct Solution {
     record: MeasurementRecord,
+    /// Gray or mosaic `[T, H, W]`.
     estimate: Array3<f32>,
+    /// `[T, 3, H, W]`, for color.
+    rgb: Option<Array4<f32>>,
+}
+
+impl Solution {
+    /// What is shown and kept: `[T, C, H, W]`, RGB for color.
+    fn video(&self) -> ArrayView4<'_, f32> {
+        match &self.rgb {
+            Some(rgb) => rgb.view(),
+            None => self.estimate.view().insert_axis(Axis(1)),
+        }
+    }
 }
 
 fn solve_all(
@@ -133,7 +151,8 @@ fn solve_all(
         let previous = solutions.last().map(|s| s.estimate.view());
         let solved = factory.solve(&problem, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
         let trace = watch.finish();
-        let solution = solution(k, solved, truth, trace, planned);
+        let mut solution = solution(k, solved, truth, trace, planned);
+        solution.record.psnr_rgb_db = solution.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
         outln!("{}", line(&solution.record));
         if solution.record.stop == crate::record::Stop::Diverged {
             eprintln!("{}", advice(&solution.record, experiment));
@@ -169,13 +188,26 @@ fn solution(
         skipped: Skipped { iterations: saved, ..Skipped::default() },
         trace,
     };
-    Solution { record, estimate: outcome.estimate }
+    Solution { record, estimate: outcome.estimate, rgb: outcome.rgb }
+}
+
+/// Mean over the frames of the PSNR over all three colors, `[T, 3, H, W]`.
+fn psnr_rgb(truth: ArrayView4<'_, f32>, video: ArrayView4<'_, f32>) -> f64 {
+    // The colors of a frame one below the other are one image of three times the height.
+    let stacked = |v: ArrayView4<'_, f32>| {
+        let (t, c, h, w) = v.dim();
+        v.as_standard_layout().into_owned().into_shape_with_order((t, c * h, w)).expect("the same number of pixels")
+    };
+    mean_over_frames(stacked(truth).view(), stacked(video).view(), psnr)
 }
 
 fn line(m: &MeasurementRecord) -> String {
     use crate::record::Stop;
     let quality = match (m.psnr_db, m.ssim) {
-        (Some(p), Some(s)) => format!("PSNR {p:6.2} dB   SSIM {s:.4}"),
+        (Some(p), Some(s)) => {
+            let rgb = m.psnr_rgb_db.map_or(String::new(), |p| format!("   RGB {p:6.2} dB"));
+            format!("PSNR {p:6.2} dB   SSIM {s:.4}{rgb}")
+        }
         _ => format!("residual {:.2e}", m.relative_residual.unwrap_or(f64::NAN)),
     };
     let note = match m.stop {
@@ -195,6 +227,7 @@ fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
         (_, Solver::Gap { momentum: Some(Momentum::Zero) }) => "set solver.momentum = \"measurement\"",
         (_, Solver::Gap { momentum: Some(_) }) => "set solver.accelerate = false",
         (_, Solver::Gap { momentum: None }) => "raise stage.0.sigma, or use another denoiser",
+        (_, Solver::TwoStage { .. }) => "raise solver.rho, or use solver.kind = \"gap\"",
         (_, Solver::Admm { .. }) => "raise solver.gamma, or use solver.kind = \"gap\"",
     };
     format!("measurement {} diverged in iteration {}: {suggestion}", m.index, m.iterations.saturating_sub(1))
@@ -285,8 +318,8 @@ fn write(
     let staging = Staging::new(out)?;
     let dir = staging.path();
     let output = &experiment.output;
-    let views: Vec<ArrayView3<'_, f32>> = solutions.iter().map(|s| s.estimate.view()).collect();
-    let video = ndarray::concatenate(Axis(0), &views).context("joining the measurements")?.insert_axis(Axis(1));
+    let views: Vec<ArrayView4<'_, f32>> = solutions.iter().map(Solution::video).collect();
+    let video = ndarray::concatenate(Axis(0), &views).context("joining the measurements")?;
     let format = match output.format {
         OutputFormat::Npy => ArrayFormat::Npy,
         OutputFormat::Npz => ArrayFormat::Npz,
@@ -306,8 +339,11 @@ fn write(
         .iter()
         .map(|s| MeasurementImages {
             measurement: scene.measurement(s.record.index),
-            recon: s.estimate.view().insert_axis(Axis(1)),
-            truth: scene.truth_of(s.record.index).map(|t| t.insert_axis(Axis(1))),
+            recon: s.video(),
+            truth: match s.rgb {
+                Some(_) => scene.rgb_of(s.record.index),
+                None => scene.truth_of(s.record.index).map(|t| t.insert_axis(Axis(1))),
+            },
         })
         .collect();
     report::write(&dir.join("report.html"), record, &images)?;

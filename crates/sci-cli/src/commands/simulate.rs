@@ -2,23 +2,26 @@
 
 use std::path::PathBuf;
 
-use ndarray::{Array3, Axis, s};
-use sci_forward::VideoShape;
+use ndarray::{Axis, s};
+use sci_forward::{CfaPattern, VideoShape};
 
 use super::mask::Kind;
 use super::{Done, UsageError, array_format, parse_density};
 use crate::io::output::{ArrayFormat, Part, write_arrays};
-use crate::io::scene::{self, Keys, Reading};
+use crate::io::scene::{self, Keys, Reading, Truth};
 use crate::simulate::{NoiseModel, simulate};
 
 /// Arguments of `sci simulate`.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
-    /// The video: .gif, .y4m, a folder of PNGs, .npy, .npz or .mat; color becomes gray
+    /// The video: .gif, .y4m, a folder of PNGs, .npy, .npz or .mat; color becomes gray without --cfa
     video: PathBuf,
     /// Where to write the scene: .npz or .mat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Measure with a color sensor of this Bayer pattern; the scene then holds the RGB truth
+    #[arg(long, value_name = "PATTERN", value_enum)]
+    cfa: Option<Cfa>,
     /// How the masks' pixels open
     #[arg(long, value_enum, default_value = "random")]
     mask: Kind,
@@ -45,6 +48,26 @@ pub(super) struct Args {
     seed: u64,
 }
 
+/// Bayer patterns on the command line.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum Cfa {
+    Rggb,
+    Bggr,
+    Grbg,
+    Gbrg,
+}
+
+impl From<Cfa> for CfaPattern {
+    fn from(cfa: Cfa) -> Self {
+        match cfa {
+            Cfa::Rggb => Self::Rggb,
+            Cfa::Bggr => Self::Bggr,
+            Cfa::Grbg => Self::Grbg,
+            Cfa::Gbrg => Self::Gbrg,
+        }
+    }
+}
+
 fn parse_sigma(text: &str) -> Result<f32, String> {
     text.parse().ok().filter(|s| (0.0..=255.0).contains(s)).ok_or_else(|| "expected a number from 0 to 255".into())
 }
@@ -63,8 +86,13 @@ impl Args {
             ))
             .into());
         }
-        let mut truth = scene::read_gray_video(&self.video, &Reading::default())?;
-        let (_, height, width) = truth.dim();
+        let cfa = self.cfa.map(CfaPattern::from);
+        let mut truth = match cfa {
+            None => scene::read_gray_video(&self.video, &Reading::default())?.insert_axis(Axis(1)),
+            Some(_) => scene::read_video(&self.video, &Reading::default())?,
+        };
+        let (_, channels, height, width) = truth.dim();
+        anyhow::ensure!(cfa.is_none() || channels == 3, "{}: --cfa needs a video in color", self.video.display());
         let masks = match &self.mask_file {
             Some(file) => scene::read_mask(file, &Reading::default())?,
             None => {
@@ -79,17 +107,22 @@ impl Args {
                 "{}: --measurements {n} needs {wanted} frames, the video has {there}",
                 self.video.display()
             );
-            truth = truth.slice_move(s![..wanted, .., ..]);
+            truth = truth.slice_move(s![..wanted, .., .., ..]);
         }
         let noise = NoiseModel { sigma: self.sigma / 255.0, photons: self.photons, seed: self.seed };
-        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, &noise)?;
+        let truth = if cfa.is_some() { Truth::Rgb(truth) } else { Truth::Sensor(truth.index_axis_move(Axis(1), 0)) };
+        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, &noise)?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {w}"));
         let mask = scene.operator.masks().view();
-        let truth: &Array3<f32> = scene.truth.as_ref().expect("a simulated scene keeps its truth");
+        let truth = match (&scene.rgb, &scene.truth) {
+            (Some(rgb), _) => Part { name: "rgb", data: rgb.view(), is_light: true },
+            (None, Some(x)) => Part { name: "orig", data: x.view().insert_axis(Axis(1)), is_light: true },
+            (None, None) => unreachable!("a simulated scene keeps its truth"),
+        };
         let parts = [
             Part { name: "mask", data: mask.insert_axis(Axis(1)), is_light: false },
             Part { name: "meas", data: scene.measurements.view().insert_axis(Axis(1)), is_light: true },
-            Part { name: "orig", data: truth.view().insert_axis(Axis(1)), is_light: true },
+            truth,
         ];
         write_arrays(&self.out, format, &parts)?;
         outln!(

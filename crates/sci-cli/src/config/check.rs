@@ -2,6 +2,9 @@
 
 use std::ops::{Range, RangeInclusive};
 
+use admm::{Convention, TwoStageParams, XStep};
+use nets::Ends;
+use sci_forward::CfaPattern;
 use toml::Value as Toml;
 
 use super::file::*;
@@ -98,6 +101,41 @@ pub enum Solver {
         /// γ.
         gamma: f32,
     },
+    /// Two-stage ADMM, for color sensors.
+    TwoStage {
+        /// ρ, τ, α and the convention.
+        params: TwoStageParams,
+        /// How the RGB video is made from the mosaic.
+        x_step: XStep,
+    },
+}
+
+/// What fills in the colors that a mosaic lacks; `P` is how a path is known.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Demosaicer<P> {
+    /// Means of neighbours.
+    Bilinear,
+    /// Malvar 2004.
+    Malvar,
+    /// Menon 2007.
+    Menon,
+    /// A network.
+    Ddnet {
+        /// Weight file.
+        weights: P,
+    },
+}
+
+impl<P> Demosaicer<P> {
+    /// The name that chooses it in TOML.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Bilinear => "bilinear",
+            Self::Malvar => "malvar",
+            Self::Menon => "menon",
+            Self::Ddnet { .. } => "ddnet",
+        }
+    }
 }
 
 /// Where y1 of accelerated GAP starts.
@@ -123,6 +161,13 @@ pub enum Denoiser {
     Ffdnet {
         /// Weight file.
         weights: PathSetting,
+    },
+    /// FastDVDnet.
+    Fastdvdnet {
+        /// Weight file.
+        weights: PathSetting,
+        /// What stands for the frames before the first and after the last.
+        ends: Ends,
     },
 }
 
@@ -174,6 +219,8 @@ pub struct Checked {
     pub solver: Solver,
     /// Where solves start.
     pub start: Start,
+    /// What demosaics color scenes; `None` if the file does not say.
+    pub demosaicer: Option<Demosaicer<PathSetting>>,
     /// All denoisers, the default first.
     pub denoisers: Vec<Denoiser>,
     /// The stages.
@@ -186,7 +233,22 @@ pub struct Checked {
     pub output: Output,
 }
 
-const TOP: [&str; 10] = ["name", "seed", "data", "solver", "denoiser", "stage", "stop", "skip", "online", "output"];
+const TOP: [&str; 12] = [
+    "name",
+    "seed",
+    "data",
+    "solver",
+    "denoiser",
+    "stage",
+    "schedule",
+    "schedules",
+    "stop",
+    "skip",
+    "online",
+    "output",
+];
+const PATTERNS: [(&str, CfaPattern); 4] =
+    [("rggb", CfaPattern::Rggb), ("bggr", CfaPattern::Bggr), ("grbg", CfaPattern::Grbg), ("gbrg", CfaPattern::Gbrg)];
 const MAX_ITERATIONS: i64 = 100_000;
 const SEEDS: RangeInclusive<i64> = 0..=i64::MAX;
 
@@ -210,6 +272,7 @@ impl<'s> Checker<'s> {
         let solver = root.take("solver")?;
         let denoiser = root.take("denoiser")?;
         let stages = root.take_list("stage")?;
+        let named = root.take("schedules")?;
         let stop = root.take("stop")?;
         let switches = [("skip", root.take("skip")?), ("online", root.take("online")?)];
         let output = root.take("output")?;
@@ -217,15 +280,15 @@ impl<'s> Checker<'s> {
         let seed = self.whole("seed", &top.seed, SEEDS)?.unwrap_or(0) as u64;
         let missing = |key: &str| self.source.file_error(format!("no [{key}] table"));
         let data = self.data(data.ok_or_else(|| missing("data"))?, seed)?;
-        let (solver, start) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
-        let (denoisers, stages) = self.stages(denoiser, stages)?;
+        let (solver, start, demosaicer) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
+        let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named)?;
         for (key, section) in switches {
             self.switched_off(key, section)?;
         }
         let (relative_change, seconds) = self.stop(stop)?;
         let name = self.name(top.name)?;
         let output = self.output(output)?;
-        Ok(Checked { name, seed, data, solver, start, denoisers, stages, relative_change, seconds, output })
+        Ok(Checked { name, seed, data, solver, start, demosaicer, denoisers, stages, relative_change, seconds, output })
     }
 
     fn name(&self, name: Value) -> Result<Option<String>, ConfigError> {
@@ -258,6 +321,7 @@ impl<'s> Checker<'s> {
                 keys: self.part_names(names)?,
                 axes: self.choice("data.axes", &k.axes, &[("hwt", Axes::Hwt), ("thw", Axes::Thw)])?,
                 scale: self.number("data.scale", &k.scale, 1e-6..=1e6)?.map(|s| s as f32),
+                cfa: self.choice("data.cfa", &k.cfa, &PATTERNS)?,
             },
             simulate,
         })
@@ -320,12 +384,16 @@ impl<'s> Checker<'s> {
         }
     }
 
-    fn solver(&self, mut section: Section<'s>) -> Result<(Solver, Start), ConfigError> {
+    fn solver(
+        &self,
+        mut section: Section<'s>,
+    ) -> Result<(Solver, Start, Option<Demosaicer<PathSetting>>), ConfigError> {
         let kind = section.take_kind(&["gap", "admm", "two-stage"], None)?;
+        let span = section.span.clone();
         match kind.get_ref().as_str() {
             "gap" => {
                 let k: GapKeys = section.read(&["kind"])?;
-                let start = self.start(k.start, k.start_iterations, k.start_weight)?;
+                let start = self.start(k.start, k.start_iterations, k.start_weight)?.unwrap_or(Start::Mean);
                 let accelerate = self.flag("solver.accelerate", &k.accelerate)?.unwrap_or(true);
                 let legal = [("zero", Momentum::Zero), ("measurement", Momentum::Measurement)];
                 let momentum = self.choice("solver.momentum", &k.momentum, &legal)?;
@@ -335,25 +403,81 @@ impl<'s> Checker<'s> {
                         .error(&m.span(), "`solver.momentum` has no effect without solver.accelerate = true"));
                 }
                 let momentum = accelerate.then(|| momentum.unwrap_or(Momentum::Measurement));
-                Ok((Solver::Gap { momentum }, start))
+                let demosaicer = self.demosaicer(k.demosaicer, k.weights, &span)?;
+                Ok((Solver::Gap { momentum }, start, demosaicer))
             }
             "admm" => {
                 let k: AdmmKeys = section.read(&["kind"])?;
-                let start = self.start(k.start, k.start_iterations, k.start_weight)?;
+                let start = self.start(k.start, k.start_iterations, k.start_weight)?.unwrap_or(Start::Mean);
                 let gamma = self.number("solver.gamma", &k.gamma, 0.0..=1e3)?.unwrap_or(0.01) as f32;
-                Ok((Solver::Admm { gamma }, start))
+                Ok((Solver::Admm { gamma }, start, self.demosaicer(k.demosaicer, k.weights, &span)?))
             }
-            _ => Err(self.not_yet("solver.kind", &kind.span(), "gap, admm")),
+            _ => self.two_stage(section.read(&["kind"])?, &span),
         }
     }
 
-    fn start(&self, start: Value, iterations: Value, weight: Value) -> Result<Start, ConfigError> {
+    fn two_stage(
+        &self,
+        k: TwoStageKeys,
+        table: &Range<usize>,
+    ) -> Result<(Solver, Start, Option<Demosaicer<PathSetting>>), ConfigError> {
+        let start = self.start(k.start, k.start_iterations, k.start_weight)?;
+        let start = start.unwrap_or(Start::Tv { iterations: 40, weight: 0.1 });
+        let positive = |key: &str, value: &Value, default: f64| {
+            let number = self.number(&format!("solver.{key}"), value, 1e-6..=1e6)?;
+            Ok(number.unwrap_or(default) as f32)
+        };
+        let legal = [("paper-code", Convention::PaperCode), ("scaled", Convention::Scaled)];
+        let params = TwoStageParams {
+            rho: positive("rho", &k.rho, 1.0)?,
+            tau: positive("tau", &k.tau, 100.0)?,
+            alpha: positive("alpha", &k.alpha, 1.0)?,
+            convention: self.choice("solver.convention", &k.convention, &legal)?.unwrap_or(Convention::PaperCode),
+        };
+        let clip = self.flag("solver.clip", &k.clip)?;
+        if k.demosaicer.as_ref().and_then(|d| d.get_ref().as_str()) == Some("closed-form") {
+            // The first x has no v yet, and comes from a demosaicer.
+            let demosaicer = self.demosaicer(None, k.weights, table)?;
+            let x_step = XStep::ClosedForm { clip: clip.unwrap_or(true) };
+            return Ok((Solver::TwoStage { params, x_step }, start, demosaicer));
+        }
+        if let Some(clip) = &k.clip {
+            let problem = "`solver.clip` has no effect without solver.demosaicer = \"closed-form\"";
+            return Err(self.source.error(&clip.span(), problem));
+        }
+        let demosaicer = self.demosaicer(k.demosaicer, k.weights, table)?;
+        Ok((Solver::TwoStage { params, x_step: XStep::Demosaic }, start, demosaicer))
+    }
+
+    fn demosaicer(
+        &self,
+        kind: Value,
+        weights: Value,
+        table: &Range<usize>,
+    ) -> Result<Option<Demosaicer<PathSetting>>, ConfigError> {
+        let legal = "malvar, menon, bilinear, ddnet, and closed-form with solver.kind = \"two-stage\"";
+        let known = |t: &str| ["malvar", "menon", "bilinear", "ddnet"].contains(&t);
+        let name = self.text("solver.demosaicer", &kind, legal, known)?;
+        if let (Some(w), false) = (&weights, name.as_deref() == Some("ddnet")) {
+            let problem = "`solver.weights` has no effect without solver.demosaicer = \"ddnet\"";
+            return Err(self.source.error(&w.span(), problem));
+        }
+        Ok(match name.as_deref() {
+            None => None,
+            Some("malvar") => Some(Demosaicer::Malvar),
+            Some("menon") => Some(Demosaicer::Menon),
+            Some("bilinear") => Some(Demosaicer::Bilinear),
+            Some(_) => Some(Demosaicer::Ddnet { weights: self.path("solver.weights", weights, table)? }),
+        })
+    }
+
+    fn start(&self, start: Value, iterations: Value, weight: Value) -> Result<Option<Start>, ConfigError> {
         let count = self.whole("solver.start_iterations", &iterations, 1..=MAX_ITERATIONS)?.unwrap_or(20) as usize;
         let tv_weight = self.number("solver.start_weight", &weight, 1e-6..=100.0)?.unwrap_or(0.1) as f32;
         let tv = Start::Tv { iterations: count, weight: tv_weight };
         let legal = [("mean", Start::Mean), ("adjoint", Start::Adjoint), ("previous", Start::Previous), ("tv", tv)];
-        let start = self.choice("solver.start", &start, &legal)?.unwrap_or(Start::Mean);
-        if !matches!(start, Start::Tv { .. }) {
+        let start = self.choice("solver.start", &start, &legal)?;
+        if !matches!(start, Some(Start::Tv { .. })) {
             let unused = [
                 ("solver.start_iterations", iterations.map(|s| s.span())),
                 ("solver.start_weight", weight.map(|s| s.span())),
@@ -365,16 +489,48 @@ impl<'s> Checker<'s> {
         Ok(start)
     }
 
-    fn stages(
+    /// The stages to run: those of the `[schedules]` that `schedule` names, else the `[[stage]]`s. All must be legal.
+    fn schedule(
         &self,
+        chosen: &Value,
         default: Option<Section<'s>>,
-        sections: Vec<Section<'s>>,
+        stages: Vec<Section<'s>>,
+        named: Option<Section<'s>>,
     ) -> Result<(Vec<Denoiser>, Vec<Stage>), ConfigError> {
-        if sections.is_empty() {
-            return Err(self.source.file_error("no [[stage]]: at least one is needed, for example iterations = 40"));
-        }
         let mut denoisers = default.map(|d| self.denoiser(d)).transpose()?.into_iter().collect::<Vec<_>>();
         let has_default = !denoisers.is_empty();
+        let mut schedules = Vec::new();
+        if let Some(mut named) = named {
+            for name in named.keys() {
+                let stages = self.stages(&mut denoisers, has_default, named.take_list(&name)?)?;
+                schedules.push((name, stages));
+            }
+        }
+        let names: Vec<String> = schedules.iter().map(|(name, _)| name.clone()).collect();
+        let legal = if names.is_empty() { "none, as there is no [schedules]".to_owned() } else { names.join(", ") };
+        let unnamed = self.stages(&mut denoisers, has_default, stages)?;
+        let stages = match self.text("schedule", chosen, &legal, |c| names.iter().any(|n| n == c))? {
+            Some(chosen) => schedules.into_iter().find(|(n, _)| *n == chosen).map_or(unnamed, |(_, stages)| stages),
+            None => unnamed,
+        };
+        if stages.is_empty() {
+            let choose = if names.is_empty() { String::new() } else { format!(", or schedule = one of {legal}") };
+            return Err(self
+                .source
+                .file_error(format!("no [[stage]]: at least one is needed, for example iterations = 40{choose}")));
+        }
+        if has_default && stages.iter().all(|s| s.denoiser != 0) {
+            return Err(self.source.file_error("[denoiser] has no effect: every [[stage]] names its own"));
+        }
+        Ok(in_use(denoisers, stages))
+    }
+
+    fn stages(
+        &self,
+        denoisers: &mut Vec<Denoiser>,
+        has_default: bool,
+        sections: Vec<Section<'s>>,
+    ) -> Result<Vec<Stage>, ConfigError> {
         let mut stages = Vec::new();
         for mut section in sections {
             let (key, span) = (section.key.clone(), section.span.clone());
@@ -393,8 +549,8 @@ impl<'s> Checker<'s> {
             let k: StageKeys = section.read(&["denoiser"])?;
             let sigma = self.number(&format!("{key}.sigma"), &k.sigma, 0.0..=255.0)?;
             let iterations =
-                self.whole(&format!("{key}.iterations"), &k.iterations, 1..=MAX_ITERATIONS)?.ok_or_else(|| {
-                    self.source.error(&span, format!("`{key}.iterations` is missing; legal: 1 to {MAX_ITERATIONS}"))
+                self.whole(&format!("{key}.iterations"), &k.iterations, 0..=MAX_ITERATIONS)?.ok_or_else(|| {
+                    self.source.error(&span, format!("`{key}.iterations` is missing; legal: 0 to {MAX_ITERATIONS}"))
                 })?;
             let sigma = match (&denoisers[denoiser], sigma, &k.sigma) {
                 (Denoiser::Tv { .. }, Some(_), Some(given)) => {
@@ -414,10 +570,7 @@ impl<'s> Checker<'s> {
             };
             stages.push(Stage { sigma, iterations: iterations as usize, denoiser });
         }
-        if has_default && stages.iter().all(|s| s.denoiser != 0) {
-            return Err(self.source.file_error("[denoiser] has no effect: every [[stage]] names its own"));
-        }
-        Ok((denoisers, stages))
+        Ok(stages)
     }
 
     fn denoiser(&self, mut section: Section<'s>) -> Result<Denoiser, ConfigError> {
@@ -435,7 +588,15 @@ impl<'s> Checker<'s> {
                 let k: NetKeys = section.read(&["kind"])?;
                 Ok(Denoiser::Ffdnet { weights: self.path(&format!("{key}.weights"), k.weights, &span)? })
             }
-            _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, ffdnet")),
+            "fastdvdnet" => {
+                let k: VideoNetKeys = section.read(&["kind"])?;
+                let ends = [("circular", Ends::Circular), ("mirrored", Ends::Mirrored)];
+                Ok(Denoiser::Fastdvdnet {
+                    ends: self.choice(&format!("{key}.ends"), &k.ends, &ends)?.unwrap_or_default(),
+                    weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
+                })
+            }
+            _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, ffdnet, fastdvdnet")),
         }
     }
 
@@ -532,4 +693,19 @@ impl<'s> Checker<'s> {
         let value = self.source.snippet(span);
         self.source.error(span, format!("`{key}` = {value} is not available yet; available: {available}"))
     }
+}
+
+/// Leaves out the denoisers of schedules that are not run, so that nothing is loaded for them.
+fn in_use(denoisers: Vec<Denoiser>, mut stages: Vec<Stage>) -> (Vec<Denoiser>, Vec<Stage>) {
+    let mut kept = Vec::new();
+    for (index, denoiser) in denoisers.into_iter().enumerate() {
+        let users = || stages.iter().filter(|s| s.denoiser == index);
+        if users().next().is_some() {
+            kept.push((index, denoiser));
+        }
+    }
+    for stage in &mut stages {
+        stage.denoiser = kept.iter().position(|(i, _)| *i == stage.denoiser).unwrap_or(0);
+    }
+    (kept.into_iter().map(|(_, d)| d).collect(), stages)
 }

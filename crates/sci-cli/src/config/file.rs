@@ -21,6 +21,7 @@ pub type Value = Option<Spanned<toml::Value>>;
 pub struct TopKeys {
     pub name: Value,
     pub seed: Value,
+    pub schedule: Value,
 }
 
 /// `[data]` of either kind; `[data.keys]`, `[data.mask]` and `[data.noise]` are read apart.
@@ -32,6 +33,7 @@ pub struct DataKeys {
     pub measurements: Value,
     pub axes: Value,
     pub scale: Value,
+    pub cfa: Value,
 }
 
 /// `[data.keys]`: the names of a scene's parts in its file.
@@ -83,6 +85,8 @@ pub struct GapKeys {
     pub start: Value,
     pub start_iterations: Value,
     pub start_weight: Value,
+    pub demosaicer: Value,
+    pub weights: Value,
 }
 
 /// `[solver]`, `kind = "admm"`.
@@ -91,6 +95,25 @@ pub struct GapKeys {
 #[allow(missing_docs)]
 pub struct AdmmKeys {
     pub gamma: Value,
+    pub start: Value,
+    pub start_iterations: Value,
+    pub start_weight: Value,
+    pub demosaicer: Value,
+    pub weights: Value,
+}
+
+/// `[solver]`, `kind = "two-stage"`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct TwoStageKeys {
+    pub rho: Value,
+    pub tau: Value,
+    pub alpha: Value,
+    pub convention: Value,
+    pub demosaicer: Value,
+    pub weights: Value,
+    pub clip: Value,
     pub start: Value,
     pub start_iterations: Value,
     pub start_weight: Value,
@@ -111,6 +134,15 @@ pub struct TvKeys {
 #[allow(missing_docs)]
 pub struct NetKeys {
     pub weights: Value,
+}
+
+/// `[denoiser]`, `kind = "fastdvdnet"`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct VideoNetKeys {
+    pub weights: Value,
+    pub ends: Value,
 }
 
 /// One `[[stage]]`; its own `denoiser` table is read apart.
@@ -212,6 +244,11 @@ impl<'s> Section<'s> {
                 .source
                 .error(&span, format!("`{key}` = {} is not legal; legal: a table", self.source.snippet(&span)))),
         }
+    }
+
+    /// The keys of this table, in their order.
+    pub fn keys(&self) -> Vec<String> {
+        self.table.keys().map(|k| k.get_ref().to_string()).collect()
     }
 
     /// Takes out `kind`, which must be one of `legal`.

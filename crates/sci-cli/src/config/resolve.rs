@@ -3,13 +3,15 @@
 use std::env;
 use std::path::{Path, PathBuf};
 
+use admm::{Convention, XStep};
+use nets::Ends;
 use serde_json::{Value, json};
 
 use super::check::{self, Checked, Mask, Momentum, PathSetting};
 use super::source::{ConfigError, Place, Source};
 use crate::io::scene::{Axes, Reading};
 
-pub use super::check::{Output, OutputFormat, RandomMask, Solver, Start};
+pub use super::check::{Demosaicer, Output, OutputFormat, RandomMask, Solver, Start};
 
 /// The environment variable that names a folder of scenes and weights.
 pub const DATA_VARIABLE: &str = "SCI_DATA";
@@ -68,6 +70,13 @@ pub enum Denoiser {
         /// Weight file, absolute.
         weights: PathBuf,
     },
+    /// FastDVDnet.
+    Fastdvdnet {
+        /// Weight file, absolute.
+        weights: PathBuf,
+        /// What stands for the frames before the first and after the last.
+        ends: Ends,
+    },
 }
 
 impl Denoiser {
@@ -76,6 +85,7 @@ impl Denoiser {
         match self {
             Self::Tv { .. } => "tv",
             Self::Ffdnet { .. } => "ffdnet",
+            Self::Fastdvdnet { .. } => "fastdvdnet",
         }
     }
 }
@@ -104,6 +114,8 @@ pub struct Experiment {
     pub solver: Solver,
     /// Where it starts.
     pub start: Start,
+    /// What demosaics color scenes; `None` if the file does not say.
+    pub demosaicer: Option<Demosaicer<PathBuf>>,
     /// All denoisers.
     pub denoisers: Vec<Denoiser>,
     /// The stages.
@@ -157,12 +169,20 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .denoisers
         .iter()
         .map(|d| match d {
-            check::Denoiser::Tv { weight, inner } => {
-                Ok(Denoiser::Tv { weight: *weight, inner: *inner })
-            }
+            check::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
             check::Denoiser::Ffdnet { weights } => Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)? }),
+            check::Denoiser::Fastdvdnet { weights, ends } => {
+                Ok(Denoiser::Fastdvdnet { weights: locate_weights(weights, source)?, ends: *ends })
+            }
         })
         .collect::<Result<_, ConfigError>>()?;
+    let demosaicer = match checked.demosaicer {
+        None => None,
+        Some(Demosaicer::Bilinear) => Some(Demosaicer::Bilinear),
+        Some(Demosaicer::Malvar) => Some(Demosaicer::Malvar),
+        Some(Demosaicer::Menon) => Some(Demosaicer::Menon),
+        Some(Demosaicer::Ddnet { weights }) => Some(Demosaicer::Ddnet { weights: locate_weights(&weights, source)? }),
+    };
     let stages = checked
         .stages
         .iter()
@@ -175,6 +195,7 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         data,
         solver: checked.solver,
         start: checked.start,
+        demosaicer,
         denoisers,
         stages,
         relative_change: checked.relative_change,
@@ -276,6 +297,7 @@ impl Experiment {
         match self.solver {
             Solver::Gap { .. } => "gap",
             Solver::Admm { .. } => "admm",
+            Solver::TwoStage { .. } => "two-stage",
         }
     }
 
@@ -317,6 +339,7 @@ impl Experiment {
             "keys": { "mask": k.mask, "meas": k.meas, "orig": k.orig, "rgb": k.rgb },
             "axes": axes,
             "scale": d.reading.scale,
+            "cfa": d.reading.cfa.map(|c| c.to_string().to_lowercase()),
         });
         if let Some(s) = &d.simulate {
             let random = |kind, r: &RandomMask| json!({ "kind": kind, "frames": r.frames, "density": r.density, "seed": r.seed });
@@ -338,7 +361,25 @@ impl Experiment {
                 "momentum": momentum.map(|m| if m == Momentum::Zero { "zero" } else { "measurement" }),
             }),
             Solver::Admm { gamma } => json!({ "kind": "admm", "gamma": gamma }),
+            Solver::TwoStage { params, .. } => json!({
+                "kind": "two-stage",
+                "rho": params.rho,
+                "tau": params.tau,
+                "alpha": params.alpha,
+                "convention": if params.convention == Convention::Scaled { "scaled" } else { "paper-code" },
+            }),
         };
+        match (&self.demosaicer, self.solver) {
+            (_, Solver::TwoStage { x_step: XStep::ClosedForm { clip }, .. }) => {
+                value["demosaicer"] = "closed-form".into();
+                value["clip"] = clip.into();
+            }
+            (Some(d), _) => value["demosaicer"] = d.kind().into(),
+            (None, _) => {}
+        }
+        if let Some(Demosaicer::Ddnet { weights }) = &self.demosaicer {
+            value["weights"] = json!(weights);
+        }
         value["start"] = match self.start {
             Start::Mean => "mean".into(),
             Start::Adjoint => "adjoint".into(),
@@ -359,5 +400,6 @@ fn denoiser_json(d: &Denoiser) -> Value {
             json!({ "kind": "tv", "weight": weight, "inner": inner })
         }
         Denoiser::Ffdnet { weights } => json!({ "kind": "ffdnet", "weights": weights }),
+        Denoiser::Fastdvdnet { weights, ends } => json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends }),
     }
 }

@@ -1,15 +1,17 @@
 //! Owns the step from files to a scene: which array plays which part, its axes, its scale, and whether all fit together.
 //!
 //! A scene is masks, measurements and, if known, the truth; all in the layouts and units of the library: `[T, H, W]`,
-//! frames in `[0, 1]`, measurements up to `Σ_t C_t`.
+//! frames in `[0, 1]`, measurements up to `Σ_t C_t`. A color scene is one of a Bayer sensor: what is measured, and the
+//! truth it is compared with, is the mosaic; RGB truth is kept beside it.
 
 use std::path::Path;
 
-use ndarray::{Array3, ArrayD, ArrayView2, ArrayView3, Axis, Ix3, IxDyn, s};
-use sci_forward::{MaskError, MaskOperator, MaskStack, SensingOperator};
+use ndarray::{Array3, Array4, ArrayD, ArrayView2, ArrayView3, ArrayView4, Axis, Ix3, Ix4, IxDyn, s};
+use sci_forward::bayer::mosaic_into;
+use sci_forward::{CfaPattern, MaskError, MaskOperator, MaskStack, SensingOperator};
 
 use super::samples::{Array, SampleType, Samples};
-use super::{FileError, Format, NamedArrays, ReadError, frames, mat, npy, read_file, read_video};
+use super::{FileError, Format, NamedArrays, ReadError, frames, mat, npy, read_file};
 
 /// The names under which a file holds the parts of a scene.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,9 +20,9 @@ pub struct Keys {
     pub mask: String,
     /// Measurements `[N, H, W]`.
     pub meas: String,
-    /// Gray (or mosaic) truth `[T, H, W]`.
+    /// Gray (or mosaic) truth `[T, H, W]`, of no account where there is `rgb`.
     pub orig: String,
-    /// Color truth `[T, H, W, 3]`.
+    /// Color truth `[T, H, W, 3]`; a scene that has it is one of a Bayer sensor.
     pub rgb: String,
 }
 
@@ -54,6 +56,8 @@ pub struct Reading {
     pub axes: Option<Axes>,
     /// What white is in the file: 255 for .mat and for whole numbers, 1 for floats of the other formats.
     pub scale: Option<f32>,
+    /// The Bayer pattern of the sensor: RGGB where there is RGB truth, none (a gray sensor) otherwise.
+    pub cfa: Option<CfaPattern>,
 }
 
 /// Why files do not make a scene.
@@ -75,13 +79,15 @@ pub enum SceneError {
         /// The names in the file.
         present: Vec<String>,
     },
-    /// Only color truth, which no solver can use yet.
-    #[error("{file}: a color scene (`{key}`, no gray `orig` or `meas`): color reconstruction is not available yet")]
-    ColorOnly {
+    /// A color sensor too small to have every color.
+    #[error("{file}: {height}×{width} pixels (rows × columns) are no color scene: a Bayer pattern needs at least 2×2")]
+    NoBayerPattern {
         /// The file.
         file: String,
-        /// The color variable.
-        key: String,
+        /// Rows.
+        height: usize,
+        /// Columns.
+        width: usize,
     },
     /// An array with the wrong number of axes.
     #[error("{file}: `{key}` has shape {shape:?}, expected {expected}")]
@@ -171,14 +177,29 @@ pub struct Scene {
     pub operator: MaskOperator,
     /// y `[N, H, W]`, up to `Σ_t C_t`.
     pub measurements: Array3<f32>,
-    /// x `[T, H, W]` in `[0, 1]`; frame `k·B + t` belongs to measurement k.
+    /// x `[T, H, W]` in `[0, 1]`, the mosaic for color; frame `k·B + t` belongs to measurement k.
     pub truth: Option<Array3<f32>>,
+    /// The RGB video `[T, 3, H, W]` in `[0, 1]` whose mosaic the truth is.
+    pub rgb: Option<Array4<f32>>,
+    /// The pattern of a color sensor, `None` for a gray one.
+    pub cfa: Option<CfaPattern>,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
 }
 
+/// What was in front of the camera.
+#[derive(Clone, Debug)]
+pub enum Truth {
+    /// As the sensor sees it: gray or a mosaic, `[T, H, W]`.
+    Sensor(Array3<f32>),
+    /// In color, `[T, 3, H, W]`.
+    Rgb(Array4<f32>),
+}
+
 impl Scene {
     /// Joins checked parts; measurements are simulated from the truth where `measurements` is `None`.
+    ///
+    /// The sensor is a color one if `cfa` says so or the truth is in color (RGGB then).
     ///
     /// # Errors
     /// [`SceneError`] if sizes differ, values are not finite, or there is neither measurement nor truth.
@@ -187,21 +208,39 @@ impl Scene {
         keys: &Keys,
         mask: Array3<f32>,
         measurements: Option<Array3<f32>>,
-        truth: Option<Array3<f32>>,
+        truth: Option<Truth>,
+        cfa: Option<CfaPattern>,
     ) -> Result<Self, SceneError> {
         let masks = MaskStack::new(mask).map_err(|source| SceneError::Mask {
             file: file.into(),
             key: keys.mask.clone(),
             source,
         })?;
-        let shape = masks.shape();
-        let mask_size = shape.image_dim();
-        for (key, array) in [(&keys.meas, &measurements), (&keys.orig, &truth)] {
-            if let Some(a) = array {
-                check_size(file, key, a, &keys.mask, mask_size)?;
-                check_finite(file, key, a)?;
-            }
+        let (height, width) = masks.shape().image_dim();
+        let check = |key: &str, array: ArrayView3<'_, f32>| {
+            check_size(file, key, array, &keys.mask, (height, width))?;
+            check_finite(file, key, array)
+        };
+        let cfa = if let Some(Truth::Rgb(_)) = truth { Some(cfa.unwrap_or_default()) } else { cfa };
+        if cfa.is_some() && (height < 2 || width < 2) {
+            return Err(SceneError::NoBayerPattern { file: file.into(), height, width });
         }
+        if let Some(m) = &measurements {
+            check(&keys.meas, m.view())?;
+        }
+        let (truth, rgb) = match truth {
+            None => (None, None),
+            Some(Truth::Sensor(x)) => {
+                check(&keys.orig, x.view())?;
+                (Some(x), None)
+            }
+            Some(Truth::Rgb(rgb)) => {
+                (0..3).try_for_each(|c| check(&keys.rgb, rgb.index_axis(Axis(1), c)))?;
+                let mut x = Array3::zeros((rgb.len_of(Axis(0)), height, width));
+                mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
+                (Some(x), Some(rgb))
+            }
+        };
         let operator = MaskOperator::new(masks);
         let mut warnings = Vec::new();
         let measurements = match (measurements, &truth) {
@@ -216,7 +255,7 @@ impl Scene {
                 });
             }
         };
-        let mut scene = Self { operator, measurements, truth, warnings };
+        let mut scene = Self { operator, measurements, truth, rgb, cfa, warnings };
         scene.look_for_wrong_scales();
         Ok(scene)
     }
@@ -251,6 +290,13 @@ impl Scene {
         (truth.len_of(Axis(0)) >= (k + 1) * b).then(|| truth.slice(s![k * b..(k + 1) * b, .., ..]))
     }
 
+    /// The RGB truth `[B, 3, H, W]` of measurement `k`, if it is known and reaches that far.
+    pub fn rgb_of(&self, k: usize) -> Option<ArrayView4<'_, f32>> {
+        let b = self.frames();
+        let rgb = self.rgb.as_ref()?;
+        (rgb.len_of(Axis(0)) >= (k + 1) * b).then(|| rgb.slice(s![k * b..(k + 1) * b, .., .., ..]))
+    }
+
     /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers.
     fn look_for_wrong_scales(&mut self) {
         let brightest = self.operator.masks().sum().iter().copied().fold(0.0, f32::max);
@@ -281,7 +327,7 @@ impl Scene {
 fn check_size(
     file: &str,
     key: &str,
-    array: &Array3<f32>,
+    array: ArrayView3<'_, f32>,
     mask: &str,
     mask_size: (usize, usize),
 ) -> Result<(), SceneError> {
@@ -292,7 +338,7 @@ fn check_size(
     Err(SceneError::SizeMismatch { file: file.into(), key: key.into(), size: (h, w), mask: mask.into(), mask_size })
 }
 
-fn check_finite(file: &str, key: &str, array: &Array3<f32>) -> Result<(), SceneError> {
+fn check_finite(file: &str, key: &str, array: ArrayView3<'_, f32>) -> Result<(), SceneError> {
     match array.indexed_iter().find(|(_, v)| !v.is_finite()) {
         None => Ok(()),
         Some(((frame, row, column), &value)) => {
@@ -351,13 +397,21 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     let missing =
         |key: &str, part| SceneError::MissingKey { file: file.clone(), key: key.into(), part, present: names.clone() };
     let mask = mask.ok_or_else(|| missing(&keys.mask, "the masks"))?;
-    if meas.is_none() && orig.is_none() {
-        return Err(match arrays.contains_key(&keys.rgb) {
-            true => SceneError::ColorOnly { file, key: keys.rgb.clone() },
-            false => missing(&keys.meas, "measurements, or `orig` to simulate them from"),
-        });
+    let rgb = arrays.remove(&keys.rgb).map(|a| to_channels(&file, &keys.rgb, a, format, reading)).transpose()?;
+    let truth = match rgb {
+        Some(rgb) if rgb.len_of(Axis(1)) == 3 => Some(Truth::Rgb(rgb)),
+        Some(gray) => return Err(not_color(&file, &keys.rgb, gray.shape())),
+        None => orig.map(Truth::Sensor),
+    };
+    if meas.is_none() && truth.is_none() {
+        return Err(missing(&keys.meas, "measurements, or `orig` or `rgb` to simulate them from"));
     }
-    Scene::new(&file, keys, normalise_mask(mask), meas, orig)
+    Scene::new(&file, keys, normalise_mask(mask), meas, truth, reading.cfa)
+}
+
+fn not_color(file: &str, key: &str, shape: &[usize]) -> SceneError {
+    let expected = "three colors: [T, H, W, 3] or [T, 3, H, W], in .mat [H, W, 3, T]";
+    SceneError::Axes { file: file.into(), key: key.into(), shape: shape.to_vec(), expected }
 }
 
 /// Masks saved as black-and-white images run to 255.
@@ -418,8 +472,7 @@ fn to_frames(
     if data.is_empty() {
         return Err(wrong(&shape));
     }
-    let default = if format == Format::Mat { Axes::Hwt } else { Axes::Thw };
-    let data = match (data.ndim(), axes.unwrap_or(default)) {
+    let data = match (data.ndim(), axes.unwrap_or(default_axes(format))) {
         (2, _) => data.insert_axis(Axis(0)),
         (3, Axes::Thw) => data,
         (3, Axes::Hwt) => data.permuted_axes(IxDyn(&[2, 0, 1])),
@@ -427,6 +480,11 @@ fn to_frames(
     };
     let data = data.into_dimensionality::<Ix3>().map_err(|_| wrong(&shape))?;
     Ok(data.as_standard_layout().into_owned())
+}
+
+/// The order of axes, unless the config says.
+fn default_axes(format: Format) -> Axes {
+    if format == Format::Mat { Axes::Hwt } else { Axes::Thw }
 }
 
 /// What white is stored as, unless the config says.
@@ -443,22 +501,33 @@ fn to_f32(array: Array, scale: f32) -> ArrayD<f32> {
     ArrayD::from_shape_vec(shape, values).expect("an Array's shape holds exactly its samples")
 }
 
-/// Reads any video as gray `[T, H, W]` in `[0, 1]`: GIF, Y4M, a folder of PNGs, or the `orig` (else `rgb`) of a file of
-/// arrays. Color becomes luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601, as MATLAB's `rgb2gray`).
+/// Reads any video as gray `[T, H, W]` in `[0, 1]`: [`read_video`], whose color becomes luma,
+/// 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601, as MATLAB's `rgb2gray`).
 ///
 /// # Errors
 /// [`SceneError`] naming the file and what is wrong with it.
 pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Array3<f32>, SceneError> {
+    Ok(luma(read_video(path, reading)?))
+}
+
+/// Reads any video, gray `[T, 1, H, W]` or color `[T, 3, H, W]`, in `[0, 1]`: GIF, Y4M, a folder of pictures, or the
+/// `orig` (else `rgb`) of a file of arrays.
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_video(path: &Path, reading: &Reading) -> Result<Array4<f32>, SceneError> {
     let file = path.display().to_string();
+    // Pictures have the one order that their reader gives them.
+    let frames = |array| to_channels(&file, "frames", array, Format::Npy, &Reading { axes: None, ..reading.clone() });
     if path.is_dir() {
-        return luma(&file, "frames", frames::read(path)?, reading);
+        return frames(frames::read(path)?);
     }
     let bytes = read_file(path)?;
     let read_error = |e| FileError::new(path, e);
     match Format::of(&bytes).map_err(read_error)? {
-        Format::Gif | Format::Y4m => luma(&file, "frames", read_video(&bytes).map_err(read_error)?, reading),
+        Format::Gif | Format::Y4m => frames(super::read_video(&bytes).map_err(read_error)?),
         Format::Png => Err(SceneError::TooFewFrames { file, frames: 1, needed: 2 }),
-        Format::Npy => gray_array(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
+        Format::Npy => to_channels(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
         Format::Mat | Format::Npz => {
             let keys = &reading.keys;
             let (mut found, format) = read_container(&bytes, &[&keys.orig, &keys.rgb])
@@ -473,47 +542,57 @@ pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Array3<f32>, Sc
                     present: found.names,
                 });
             };
-            gray_array(&file, key, array, format, reading)
+            to_channels(&file, key, array, format, reading)
         }
     }
 }
 
-fn gray_array(
+/// A video as `[T, C, H, W]`, C = 1 or 3, divided by its scale.
+fn to_channels(
     file: &str,
     key: &str,
     array: Array,
     format: Format,
     reading: &Reading,
-) -> Result<Array3<f32>, SceneError> {
-    if array.shape().len() == 4 && format != Format::Mat {
-        return luma(file, key, array, reading);
+) -> Result<Array4<f32>, SceneError> {
+    if array.shape().len() != 4 {
+        return Ok(to_frames(file, key, array, format, reading.axes, reading.scale)?.insert_axis(Axis(1)));
     }
-    to_frames(file, key, array, format, reading.axes, reading.scale)
+    let scale = reading.scale.unwrap_or_else(|| default_scale(format, array.stored()));
+    let mut data = to_f32(array, scale);
+    if format == Format::Mat {
+        data = data.reversed_axes();
+    }
+    let axes = reading.axes.unwrap_or(default_axes(format));
+    let order = match (axes, data.shape()) {
+        _ if data.is_empty() => None,
+        (Axes::Hwt, [_, _, 1 | 3, _]) => Some([3, 2, 0, 1]),
+        (Axes::Thw, [_, 1 | 3, _, _]) => Some([0, 1, 2, 3]),
+        (Axes::Thw, [_, _, _, 1 | 3]) => Some([0, 3, 1, 2]),
+        _ => None,
+    };
+    let shape = data.shape().to_vec();
+    order
+        .and_then(|order| data.permuted_axes(IxDyn(&order)).into_dimensionality::<Ix4>().ok())
+        .map(|data| data.as_standard_layout().into_owned())
+        .ok_or_else(|| SceneError::Axes {
+            file: file.into(),
+            key: key.into(),
+            shape,
+            expected: "[T, H, W], [T, 1, H, W], [T, 3, H, W] or [T, H, W, 3] (in .mat [H, W, 3, T]), none of length 0",
+        })
 }
 
-/// A video `[T, C, H, W]` or `[T, H, W, C]`, C = 1 or 3, as luma.
-fn luma(file: &str, key: &str, array: Array, reading: &Reading) -> Result<Array3<f32>, SceneError> {
-    let wrong = |shape: &[usize]| SceneError::Axes {
-        file: file.into(),
-        key: key.into(),
-        shape: shape.to_vec(),
-        expected: "[T, H, W], [T, 1, H, W], [T, 3, H, W] or [T, H, W, 3], none of length 0",
-    };
-    let scale = reading.scale.unwrap_or_else(|| default_scale(Format::Npy, array.stored()));
-    let data = to_f32(array, scale);
-    let shape = data.shape().to_vec();
-    let channel_axis = match shape[..] {
-        [0, ..] | [_, 0, ..] | [_, _, 0, _] | [_, _, _, 0] => return Err(wrong(&shape)),
-        [_, 1 | 3, _, _] => 1,
-        [_, _, _, 1 | 3] => 3,
-        _ => return Err(wrong(&shape)),
-    };
-    let weights: &[f32] = if shape[channel_axis] == 1 { &[1.0] } else { &[0.299, 0.587, 0.114] };
-    let mut gray = ArrayD::zeros(data.index_axis(Axis(channel_axis), 0).raw_dim());
-    for (c, &weight) in weights.iter().enumerate() {
-        gray.scaled_add(weight, &data.index_axis(Axis(channel_axis), c));
+/// A video `[T, C, H, W]`, C = 1 or 3, as luma.
+fn luma(video: Array4<f32>) -> Array3<f32> {
+    if video.len_of(Axis(1)) == 1 {
+        return video.index_axis_move(Axis(1), 0);
     }
-    gray.into_dimensionality::<Ix3>().map_err(|_| wrong(&shape))
+    let mut gray = Array3::zeros(video.index_axis(Axis(1), 0).raw_dim());
+    for (channel, weight) in video.axis_iter(Axis(1)).zip([0.299, 0.587, 0.114]) {
+        gray.scaled_add(weight, &channel);
+    }
+    gray
 }
 
 /// Reads masks `[B, H, W]` alone, from a file of arrays (`mask`), a `.npy`, or a folder of PNGs.
@@ -524,7 +603,7 @@ pub fn read_mask(path: &Path, reading: &Reading) -> Result<MaskStack, SceneError
     let file = path.display().to_string();
     let keys = &reading.keys;
     let masks = if path.is_dir() && !path.join(format!("{}.npy", keys.mask)).is_file() {
-        luma(&file, "frames", frames::read(path)?, &Reading::default())?
+        luma(to_channels(&file, "frames", frames::read(path)?, Format::Npy, &Reading::default())?)
     } else {
         let member = if path.is_dir() { path.join(format!("{}.npy", keys.mask)) } else { path.to_owned() };
         let bytes = read_file(&member)?;
