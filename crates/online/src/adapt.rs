@@ -349,11 +349,12 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
 /// Why an update is to be undone, unless nothing is held out to judge it.
 fn objection(before: SplitLoss, after: SplitLoss) -> Option<RollBack> {
     let (Some(held_before), Some(held_after)) = (before.held_out, after.held_out) else { return None };
-    // Nothing compares with a NaN: what was not finite before is not worth keeping either.
-    if !(held_after < held_before) {
-        Some(RollBack::HeldOut)
-    } else {
-        (!(after.loss < before.loss)).then_some(RollBack::Loss)
+    // What was not finite before is not worth keeping either: nothing falls below a NaN.
+    let falls = |before: f64, after: f64| after < before;
+    match (falls(held_before, held_after), falls(before.loss, after.loss)) {
+        (true, true) => None,
+        (true, false) => Some(RollBack::Loss),
+        (false, _) => Some(RollBack::HeldOut),
     }
 }
 

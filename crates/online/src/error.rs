@@ -6,7 +6,7 @@
 pub enum Error {
     /// The network, its tensors or a weight file.
     #[error(transparent)]
-    Net(#[from] nets::Error),
+    Net(Box<nets::Error>),
     /// The network refused to denoise.
     #[error("the network could not denoise")]
     Denoiser(#[source] admm::BoxError),
@@ -58,12 +58,18 @@ pub enum Error {
         /// Its number, from 0.
         index: usize,
         /// Why.
-        source: admm::SolveError,
+        source: Box<admm::SolveError>,
     },
+}
+
+impl From<nets::Error> for Error {
+    fn from(error: nets::Error) -> Self {
+        Self::Net(Box::new(error))
+    }
 }
 
 impl From<candle_core::Error> for Error {
     fn from(error: candle_core::Error) -> Self {
-        Self::Net(error.into())
+        Self::Net(Box::new(error.into()))
     }
 }

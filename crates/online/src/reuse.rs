@@ -53,6 +53,9 @@ impl Default for Similarity {
 
 /// The arrangement of the previous result `[T, H, W]` that fits the new measurement best, and how well it does:
 /// as it is, its last frame standing still, or running backwards (the motion goes on from the last frame).
+///
+/// # Panics
+/// If the previous result has not the size of the new one.
 pub fn continuation(previous: ArrayView3<'_, f32>, snapshot: &Snapshot) -> (Array3<f32>, Relation) {
     let (y, operator) = (snapshot.y(), snapshot.operator());
     let norm = norm(y).max(f64::MIN_POSITIVE);

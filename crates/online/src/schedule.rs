@@ -95,10 +95,13 @@ mod tests {
         fired
     }
 
-    /// The rows of the paper's code: iterations, interval, limit, and where its updates fall.
+    /// Name, iterations, interval, limit, and where the updates fall.
+    type Row = (&'static str, usize, usize, Option<usize>, &'static [usize]);
+
+    /// Rows of the paper's code.
     #[test]
     fn the_papers_table() {
-        let table: [(&str, usize, usize, Option<usize>, &[usize]); 8] = [
+        let table: [Row; 8] = [
             ("FFDNet, Beauty", 25, 15, None, &[15]),
             ("FFDNet, Bosphorus", 20, 8, None, &[8, 16]),
             ("FFDNet, ShakeNDry", 20, 10, None, &[10]),

@@ -157,7 +157,8 @@ pub fn run_sequence<N: Network + Denoiser, S>(
     for snapshot in snapshots {
         let task = sequence.begin(denoiser, snapshot)?;
         let before = denoiser.updates().len();
-        let outcome = solve(denoiser, &task).map_err(|source| Error::Solve { index: task.index, source })?;
+        let outcome =
+            solve(denoiser, &task).map_err(|source| Error::Solve { index: task.index, source: Box::new(source) })?;
         sequence.finish(outcome.estimate.view());
         let updates = denoiser.updates()[before..].to_vec();
         solved.push(Solved { outcome, relation: task.relation, warm: task.is_warm(), cut: task.cut, updates });
