@@ -11,7 +11,7 @@ use ndarray::{Array3, Axis, s};
 use ndarray_npy::NpzReader;
 use nets::{Ffdnet, Network};
 use online::{
-    AdaptConfig, AdaptiveDenoiser, Guard, Outcome, Parameters, Reuse, Schedule, SequenceConfig, Snapshot, run_sequence,
+    AdaptConfig, AdaptiveDenoiser, Outcome, Parameters, Reuse, Schedule, SequenceConfig, Snapshot, run_sequence,
 };
 use sci_forward::metrics::{mean_over_frames, psnr};
 use sci_forward::{MaskOperator, MaskStack, SensingOperator};
@@ -85,11 +85,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: adapt WEIGHTS SCENE.npz [key=value]...".into());
     };
     let mut settings = Settings {
-        adapt: AdaptConfig {
-            schedule: Schedule { interval: 10, steps: 1, learning_rate: 1e-5, ..Schedule::PAPER_FFDNET },
-            guard: Guard::ON,
-            ..AdaptConfig::PAPER_FFDNET
-        },
+        adapt: AdaptConfig::default(),
         sequence: SequenceConfig::default(),
         stages: [50.0, 25.0, 12.0, 6.0].map(|s: f32| Stage { sigma: s / 255.0, iterations: 5 }).to_vec(),
         measurements: usize::MAX,
@@ -131,9 +127,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         let (a, b) = (quality(&plain.outcome.estimate), quality(&adaptive.outcome.estimate));
         let (ta, tb) = (plain.outcome.seconds, adaptive.outcome.seconds);
         sums.iter_mut().zip([a, b, ta, tb]).for_each(|(sum, v)| *sum += v / clips.len() as f64);
-        let relation = adaptive.relation.map_or(String::new(), |r| {
-            format!("  residual {:.4} still {:.4} ratio {:.3}", r.previous, r.still, r.ratio())
-        });
+        let relation = adaptive
+            .relation
+            .map_or(String::new(), |r| format!("  of start {:.3}, of scene {:.3}", r.of_start(), r.of_scene()));
         println!(
             "{i}: {a:.3} -> {b:.3} dB ({:+.3}), {ta:.2} -> {tb:.2} s, {} iterations{}{}{relation}",
             b - a,

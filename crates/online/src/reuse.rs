@@ -1,7 +1,7 @@
 //! What the next measurement may take over from the last, decided by the measurement alone.
 
 use crate::Snapshot;
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, Zip, s};
 use serde::{Deserialize, Serialize};
 
 /// What is left of one measurement when the next begins.
@@ -20,34 +20,48 @@ pub enum Reuse {
 pub struct Relation {
     /// Of the previous result, arranged as it fits best.
     pub previous: f64,
-    /// Of a still image as smooth as a 3×3 mean of the measurement: what can be said without any knowledge of the scene.
+    /// Of a still image as smooth as a 3×3 mean of the measurement: a start that needs no knowledge of the scene.
     ///
     /// The solvers' own start `y / Σ_t C_t` cannot serve: it explains every measurement without a residual.
     pub still: f64,
+    /// Of the best constant: no picture at all.
+    pub flat: f64,
 }
 
 impl Relation {
-    /// `previous / still`: small when the scene barely changed, 1 when the previous result is worth nothing.
-    pub fn ratio(&self) -> f64 {
-        // A measurement that a smooth still image explains exactly needs no previous result.
-        if self.previous == 0.0 { 0.0 } else { self.previous / self.still.max(f64::MIN_POSITIVE) }
+    /// `previous / still`: below 1 the previous result is the better start.
+    pub fn of_start(&self) -> f64 {
+        quotient(self.previous, self.still)
+    }
+
+    /// `previous / flat`: a picture of something else explains the measurement worse than none.
+    ///
+    /// Measured with true frames: at most 1.11 from one measurement to the next in 17 pairs of five scenes with fast
+    /// motion, at least 1.30 in all 20 cuts between them.
+    pub fn of_scene(&self) -> f64 {
+        quotient(self.previous, self.flat)
     }
 }
 
-/// From which [`Relation::ratio`] on the previous result is good for what.
+fn quotient(a: f64, b: f64) -> f64 {
+    // What is explained exactly was explained well, whatever the other does.
+    if a == 0.0 { 0.0 } else { a / b.max(f64::MIN_POSITIVE) }
+}
+
+/// From where on the previous result is good for what.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Similarity {
-    /// Up to here the scene barely changed: fewer iterations and updates.
+    /// Up to this [`Relation::of_start`] the scene barely changed: fewer iterations and updates.
     pub unchanged: f64,
-    /// Up to here the previous result is a better start than the normal one.
+    /// Up to this [`Relation::of_start`] the previous result takes the place of the normal start.
     pub warm: f64,
-    /// Above it the scene was cut: everything begins anew.
+    /// Above this [`Relation::of_scene`] the scene was cut: everything begins anew.
     pub cut: f64,
 }
 
 impl Default for Similarity {
     fn default() -> Self {
-        Self { unchanged: 0.7, warm: 1.0, cut: 1.5 }
+        Self { unchanged: 0.7, warm: 1.0, cut: 1.2 }
     }
 }
 
@@ -68,15 +82,18 @@ pub fn continuation(previous: ArrayView3<'_, f32>, snapshot: &Snapshot) -> (Arra
         .map(|video| (video, residual(video)))
         .min_by(|a, b| a.1.total_cmp(&b.1))
         .expect("there are three candidates");
-    let still = distance(still_image(snapshot).view(), y) / norm;
-    (best.as_standard_layout().into_owned(), Relation { previous, still })
+    let open = operator.forward(Array3::ones(snapshot.shape().dim()).view());
+    let still = distance(still_image(snapshot, &open).view(), y) / norm;
+    let dot = |a: ArrayView2<'_, f32>| Zip::from(a).and(&open).fold(0.0, |sum, &a, &b| sum + f64::from(a * b));
+    let constant = (dot(y) / dot(open.view()).max(f64::MIN_POSITIVE)) as f32;
+    let flat = distance((&open * constant).view(), y) / norm;
+    (best.as_standard_layout().into_owned(), Relation { previous, still, flat })
 }
 
-/// `H` of the smooth still image: `s(p) = Σ_q a(q) y(q) / Σ_q a(q)²` over the 3×3 neighbours q of p (of the same color),
+/// `H` of the smooth still image, `open = a`: `s(p) = Σ_q a(q) y(q) / Σ_q a(q)²` over the 3×3 neighbours q of p (of the same color),
 /// `a = Σ_t C_t`, which is the constant that fits y there best in the sense of least squares.
-fn still_image(snapshot: &Snapshot) -> Array2<f32> {
+fn still_image(snapshot: &Snapshot, open: &Array2<f32>) -> Array2<f32> {
     let y = snapshot.y();
-    let open = snapshot.operator().forward(Array3::ones(snapshot.shape().dim()).view());
     let step = if snapshot.cfa().is_some() { 2 } else { 1 };
     let (height, width) = y.dim();
     Array2::from_shape_fn(y.dim(), |(i, j)| {
@@ -97,5 +114,5 @@ fn norm(y: ArrayView2<'_, f32>) -> f64 {
 }
 
 fn distance(a: ArrayView2<'_, f32>, b: ArrayView2<'_, f32>) -> f64 {
-    ndarray::Zip::from(a).and(b).fold(0.0, |sum, &a, &b| sum + f64::from(a - b).powi(2)).sqrt()
+    Zip::from(a).and(b).fold(0.0, |sum, &a, &b| sum + f64::from(a - b).powi(2)).sqrt()
 }

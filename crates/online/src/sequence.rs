@@ -85,11 +85,9 @@ impl Sequence {
             return Err(Error::Setting { key: "effort", value: config.effort.to_string(), legal });
         }
         let Similarity { unchanged, warm, cut } = config.similarity;
-        if !(0.0 <= unchanged && unchanged <= warm && warm <= cut) {
-            let value = format!("{unchanged}, {warm}, {cut}");
-            return Err(Error::Setting {
-                key: "unchanged, warm, cut", value, legal: "0 ≤ unchanged ≤ warm ≤ cut"
-            });
+        if !(0.0 <= unchanged && unchanged <= warm && cut >= 0.0) {
+            let (key, value) = ("unchanged, warm, cut", format!("{unchanged}, {warm}, {cut}"));
+            return Err(Error::Setting { key, value, legal: "0 ≤ unchanged ≤ warm, and cut at least 0" });
         }
         Ok(Self { config, previous: None, index: 0 })
     }
@@ -109,8 +107,8 @@ impl Sequence {
         let previous = self.previous.take().filter(|_| self.config.reuse == Reuse::CarryOver).filter(usable);
         let known = previous.map(|video| continuation(video.view(), &snapshot));
         let relation = known.as_ref().map(|(_, relation)| *relation);
-        let within = |limit: f64| relation.is_some_and(|relation| relation.ratio() <= limit);
-        let cut = relation.is_some() && !within(similarity.cut);
+        let cut = relation.is_some_and(|relation| relation.of_scene() > similarity.cut);
+        let within = |limit: f64| !cut && relation.is_some_and(|relation| relation.of_start() <= limit);
         if cut || self.config.reuse == Reuse::Reset {
             denoiser.reset()?;
         }
