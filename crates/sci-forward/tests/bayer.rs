@@ -68,7 +68,7 @@ fn the_four_patterns_are_one_pattern_shifted() {
         for (cfa, top, left) in [(CfaPattern::Grbg, 0, 1), (CfaPattern::Gbrg, 1, 0), (CfaPattern::Bggr, 1, 1)] {
             let part = demosaic(&mut *method, cfa, &wide.slice(s![.., top.., left..]).to_owned());
             // Menon looks far: its directions are decided from changes of interpolated differences.
-        let inner = s![.., .., 14..26, 14..24];
+            let inner = s![.., .., 14..26, 14..24];
             let expected = whole.slice(s![.., .., top.., left..]);
             let worst = (&part.slice(inner) - &expected.slice(inner)).fold(0f32, |m, d| m.max(d.abs()));
             assert!(worst < 1e-6, "{name} {cfa}: {worst}");
