@@ -73,7 +73,7 @@ impl Log {
 
     pub(super) fn step(&mut self, report: &StepReport) -> anyhow::Result<()> {
         self.open.push(*report);
-        if report.step % STEPS_PER_LINE != 0 {
+        if !report.step.is_multiple_of(STEPS_PER_LINE) {
             return Ok(());
         }
         let steps = std::mem::take(&mut self.open);
