@@ -2,7 +2,7 @@
 //!
 //! The page is a template, a style sheet and a script of this folder with the record and the pictures put in as JSON;
 //! the script draws everything, so that there is one place that knows the layout. Pictures are PNG data URIs. The
-//! error picture is not stored: the script computes it from result and truth, which saves a third of the size.
+//! error picture and the mosaic are not stored: the script computes them from result and truth.
 
 use std::io::Write;
 use std::path::Path;
@@ -12,6 +12,7 @@ use base64::engine::general_purpose::STANDARD;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder, ImageError};
 use ndarray::{ArrayView2, ArrayView3, ArrayView4, Axis, Zip};
+use sci_forward::CfaPattern;
 use serde::Serialize;
 
 use crate::io::frames::to_byte;
@@ -29,6 +30,8 @@ pub struct MeasurementImages<'a> {
     pub measurement: ArrayView2<'a, f32>,
     /// The result `[T, C, H, W]`.
     pub recon: ArrayView4<'a, f32>,
+    /// The sensor's pattern: of an RGB result the page also shows the mosaic that the sensor sees of it.
+    pub cfa: Option<CfaPattern>,
     /// The truth `[T, C, H, W]`, if known.
     pub truth: Option<ArrayView4<'a, f32>>,
 }
@@ -45,6 +48,8 @@ struct Data<'a> {
 struct Pictures {
     measurement: String,
     recon: Vec<String>,
+    /// Row and column of the red site, if the result is RGB.
+    red_site: Option<(usize, usize)>,
     truth: Option<Vec<String>>,
     psnr_db: Vec<Option<f64>>,
 }
@@ -104,6 +109,7 @@ impl Pictures {
         Ok(Self {
             measurement: data_uri(measurement.view())?,
             recon: uris(images.recon)?,
+            red_site: images.cfa.filter(|_| images.recon.dim().1 == 3).map(CfaPattern::red_site),
             truth: images.truth.map(uris).transpose()?,
             psnr_db,
         })

@@ -340,6 +340,7 @@ fn write(
         .map(|s| MeasurementImages {
             measurement: scene.measurement(s.record.index),
             recon: s.video(),
+            cfa: scene.cfa,
             truth: match s.rgb {
                 Some(_) => scene.rgb_of(s.record.index),
                 None => scene.truth_of(s.record.index).map(|t| t.insert_axis(Axis(1))),

@@ -163,28 +163,42 @@ function head(r) {
   if (r.peak_rss_bytes) list.splice(6, 0, ["peak memory", `${Math.round(r.peak_rss_bytes / 2 ** 20)} MiB`]);
   facts(section(), list);
 }
+/** The RGBA bytes of a picture. */
+function pixels(image) {
+  const c = document.createElement("canvas");
+  c.width = image.naturalWidth; c.height = image.naturalHeight;
+  const cx = c.getContext("2d", { willReadFrequently: true });
+  cx.drawImage(image, 0, 0);
+  return cx.getImageData(0, 0, c.width, c.height).data;
+}
+/** Fills a canvas of the image's size, `paint(out, i, x, y)` writing red, green and blue of the pixel at byte `i`. */
+function draw(canvas, image, paint) {
+  const w = canvas.width = image.naturalWidth, h = canvas.height = image.naturalHeight;
+  const cx = canvas.getContext("2d"), picture = cx.createImageData(w, h);
+  for (let i = 0; i < picture.data.length; i += 4) {
+    paint(picture.data, i, i / 4 % w, Math.floor(i / 4 / w));
+    picture.data[i + 3] = 255;
+  }
+  cx.putImageData(picture, 0, 0);
+}
 /** |result − truth| through a black-red-yellow-white map that saturates at `limit`. */
 function drawError(canvas, result, truth, limit) {
-  const w = result.naturalWidth, h = result.naturalHeight;
-  const pixels = image => {
-    const c = document.createElement("canvas");
-    c.width = w; c.height = h;
-    const cx = c.getContext("2d", { willReadFrequently: true });
-    cx.drawImage(image, 0, 0);
-    return cx.getImageData(0, 0, w, h).data;
-  };
   const a = pixels(result), b = pixels(truth);
-  canvas.width = w; canvas.height = h;
-  const cx = canvas.getContext("2d"), out = cx.createImageData(w, h);
-  for (let i = 0; i < a.length; i += 4) {
+  draw(canvas, result, (out, i) => {
     const e = (Math.abs(a[i] - b[i]) + Math.abs(a[i + 1] - b[i + 1]) + Math.abs(a[i + 2] - b[i + 2])) / (3 * 255);
     const v = Math.min(1, e / limit) * 3;
-    out.data[i] = 255 * Math.min(1, v);
-    out.data[i + 1] = 255 * Math.min(1, Math.max(0, v - 1));
-    out.data[i + 2] = 255 * Math.min(1, Math.max(0, v - 2));
-    out.data[i + 3] = 255;
-  }
-  cx.putImageData(out, 0, 0);
+    out[i] = 255 * Math.min(1, v);
+    out[i + 1] = 255 * Math.min(1, Math.max(0, v - 1));
+    out[i + 2] = 255 * Math.min(1, Math.max(0, v - 2));
+  });
+}
+/** What the sensor sees of the result: of each pixel the one color that its filter lets through. */
+function drawMosaic(canvas, result, [redRow, redColumn]) {
+  const a = pixels(result);
+  draw(canvas, result, (out, i, x, y) => {
+    const channel = ((y ^ redRow) & 1) + ((x ^ redColumn) & 1);
+    out[i] = out[i + 1] = out[i + 2] = a[i + channel];
+  });
 }
 const ERROR_LIMIT = 0.25;
 function viewer(r, images) {
@@ -203,6 +217,7 @@ function viewer(r, images) {
     return [f, node];
   };
   const [, measured] = figure("img", "measured", "measurement (one exposure, scaled to its largest value)");
+  const [mosaicBox, mosaic] = figure("canvas", "mosaic", "mosaic (the result as the sensor reads it through its color filters)");
   const [, result] = figure("img", "result", "result");
   const [truthBox, truth] = figure("img", "truth", "truth");
   const [errorBox, error] = figure("canvas", "error", `|error|, white from ${ERROR_LIMIT} of full scale`);
@@ -215,6 +230,7 @@ function viewer(r, images) {
     const set = now(), t = +slider.value;
     result.src = set.recon[t];
     result.dataset.frame = t;
+    if (set.red_site) ready(result).then(() => { if (+slider.value === t) drawMosaic(mosaic, result, set.red_site); }, () => {});
     if (set.truth) {
       truth.src = set.truth[t];
       Promise.all([ready(result), ready(truth)]).then(() => { if (+slider.value === t) drawError(error, result, truth, ERROR_LIMIT); }, () => {});
@@ -227,6 +243,7 @@ function viewer(r, images) {
     const set = now(), m = r.measurements[+choice.value], s = m.skipped;
     measured.src = set.measurement;
     slider.max = set.recon.length - 1;
+    mosaicBox.hidden = !set.red_site;
     truthBox.hidden = errorBox.hidden = !set.truth;
     perFrame.hidden = !set.psnr_db.length;
     perFrame.querySelectorAll("svg").forEach(n => n.remove());
