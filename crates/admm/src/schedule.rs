@@ -14,7 +14,7 @@ pub struct Stage {
 /// When to stop before the schedule is done.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StopRule {
-    /// `Converged` once `‖x_k − x_{k−1}‖ / ‖x_k‖` is at most this; 0 never.
+    /// `Converged` once `‖x_k − x_{k−1}‖ / ‖x_k‖` is below this; 0 never.
     pub relative_change: f64,
     /// `TimeUp` after the iteration that passes this.
     pub time: Option<Duration>,

@@ -159,7 +159,7 @@ pub fn run<S: Solver>(
             let info = IterInfo { iteration, stage, sigma, estimate, rgb, relative_residual, relative_change, seconds };
             stop = match observer.iteration(&info).map_err(|source| SolveError::Observer { iteration, source })? {
                 ControlFlow::Break(()) => StopReason::Observer,
-                _ if relative_change <= plan.stop.relative_change => StopReason::Converged,
+                _ if relative_change < plan.stop.relative_change => StopReason::Converged,
                 _ if plan.stop.time.is_some_and(|limit| clock.elapsed() >= limit) => StopReason::TimeUp,
                 _ => continue,
             };
