@@ -125,9 +125,10 @@ fn run_sci(sci: &Path, name: &str, scene: &Path, weights: Option<&Path>) -> anyh
     Ok(serde_json::from_str(&record)?)
 }
 
-/// `cargo bench -p nets --bench kernels` against `peer.py conv`, shape by shape.
+/// `cargo bench -p nets --bench kernels` (ours and candle's convolutions, the peak of a matrix product) beside `peer.py conv`,
+/// shape by shape, and the geometric mean of the peer's times over each.
 pub(crate) fn kernels(options: &Options) -> anyhow::Result<()> {
-    const TIMES: [(&str, &str); 2] = [("forward", "forward_ms"), ("forward+backward", "forward_backward_ms")];
+    const TIMES: [&str; 2] = ["forward", "forward_backward"];
     let peer = options.peer_script()?;
     let ours: Vec<Value> = json_lines(&output(cargo().args(["bench", "-p", "nets", "--bench", "kernels"]))?).collect();
     let theirs: Vec<Value> = match &peer {
@@ -136,26 +137,46 @@ pub(crate) fn kernels(options: &Options) -> anyhow::Result<()> {
     };
     let same = |a: &Value, b: &Value| ["batch", "channels", "size"].iter().all(|k| a[*k] == b[*k]);
     let mut rows = Vec::new();
-    println!("{:<18} {:<17} {:>10} {:>10} {:>7}", "batch×channels×size", "", "sci ms", "peer ms", "ratio");
+    println!("{:<18} {:<17} {:<7} {:>9} {:>12} {:>7}", "GFLOP/s, direct", "", "", "", "peer", "ratio");
     for row in &ours {
-        for (what, key) in TIMES {
-            let Some(own) = row[key].as_f64() else { continue };
-            let other = theirs.iter().find(|r| same(r, row)).and_then(|r| r[key].as_f64());
-            let ratio = other.map(|o| o / own);
+        let Some(name) = row["conv"].as_str() else {
+            println!(
+                "{:<18} {:<17} {:<7} {:>9.0}",
+                "matrix product",
+                "",
+                row["gemm"].as_str().unwrap_or(""),
+                row["gflops"].as_f64().unwrap_or(f64::NAN)
+            );
+            continue;
+        };
+        for what in TIMES {
+            let rate = |v: &Value| v[format!("{what}_gflops")].as_f64();
+            let Some(own) = rate(row) else { continue };
+            let other = theirs.iter().find(|r| same(r, row)).and_then(rate);
+            let ratio = other.map(|o| own / o);
             let shape = format!("{}×{}×{}²", row["batch"], row["channels"], row["size"]);
-            let cell = |v: Option<f64>| v.map_or("–".to_owned(), |v| format!("{v:.2}"));
-            println!("{shape:<18} {what:<17} {own:>10.2} {:>10} {:>7}", cell(other), cell(ratio));
-            rows.push(json!({ "shape": shape, "what": what, "sci_ms": own, "peer_ms": other, "ratio": ratio }));
+            let cell = |v: Option<f64>, digits| v.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
+            println!("{shape:<18} {what:<17} {name:<7} {own:>9.0} {:>12} {:>7}", cell(other, 0), cell(ratio, 2));
+            rows.push(
+                json!({ "shape": shape, "what": what, "of": name, "gflops": own, "peer": other, "ratio": ratio }),
+            );
         }
     }
     ensure!(!rows.is_empty(), "the kernel benchmark printed no result");
-    let ratios: Vec<f64> = rows.iter().filter_map(|r| r["ratio"].as_f64()).collect();
-    let mut result = json!({ "benchmark": "kernels", "rows": rows });
-    if !ratios.is_empty() {
-        let mean = (ratios.iter().map(|r| r.ln()).sum::<f64>() / ratios.len() as f64).exp();
-        println!("geometric mean of the ratios: {mean:.2}");
-        result["geometric_mean"] = json!(mean);
+    let mut result = json!({ "benchmark": "kernels" });
+    for what in TIMES {
+        let ratios: Vec<f64> = rows
+            .iter()
+            .filter(|r| r["of"] == "ours" && r["what"] == what)
+            .filter_map(|r| r["ratio"].as_f64())
+            .collect();
+        if !ratios.is_empty() {
+            let mean = (ratios.iter().map(|r| r.ln()).sum::<f64>() / ratios.len() as f64).exp();
+            println!("{what}: {mean:.2} times the peer, geometric mean");
+            result[format!("{what}_geometric_mean")] = json!(mean);
+        }
     }
+    result["rows"] = json!(rows);
     save("kernels", result, options)
 }
 
