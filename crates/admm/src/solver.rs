@@ -146,11 +146,12 @@ pub fn run<S: Solver>(
             iterations += 1;
             let estimate = solver.estimate(&state);
             let rgb = solver.rgb(&state);
+            let rgb_is_finite = rgb.is_none_or(|rgb| rgb.iter().all(|v| v.is_finite()));
             clock.pause();
 
             let (residual, relative_change) = relative(progress, problem);
             let good = residual <= plan.stop.diverged_above && relative_change.is_finite();
-            if !good || rgb.is_some_and(|rgb| !rgb.iter().all(|v| v.is_finite())) {
+            if !good || !rgb_is_finite {
                 stop = StopReason::Diverged;
                 break 'stages;
             }

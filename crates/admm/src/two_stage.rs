@@ -116,10 +116,10 @@ impl<D: Denoiser, M: Demosaicer> TwoStage<D, M> {
         Self { denoiser, demosaicer, x_step, cfa, params }
     }
 
-    /// The divisor of the duals where they enter the primal updates: `(of b, of w)`.
+    /// How the duals enter the primal updates: `(divisor of b, factor of w)`.
     fn dual_scales(&self) -> (f32, f32) {
         match self.params.convention {
-            Convention::PaperCode => (self.params.rho, self.params.tau),
+            Convention::PaperCode => (self.params.rho, -1.0 / self.params.tau),
             Convention::Scaled => (1.0, 1.0),
         }
     }
@@ -175,7 +175,7 @@ impl<D: Denoiser, M: Demosaicer> Solver for TwoStage<D, M> {
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut TwoStageState) -> Result<Progress, BoxError> {
         let first = cx.iteration == 0;
-        let (b_scale, w_scale) = self.dual_scales();
+        let (b_scale, w_factor) = self.dual_scales();
         let TwoStageState { theta, tx, q, b, mosaic, .. } = state;
         let link = tx.as_ref().unwrap_or(theta);
         Zip::from(&mut *mosaic).and(link).and(&*b).par_for_each(|p, &link, &b| *p = link - b / b_scale);
@@ -193,13 +193,12 @@ impl<D: Denoiser, M: Demosaicer> Solver for TwoStage<D, M> {
             mosaic_into(self.cfa, x.view(), tx.view_mut());
         }
         // The denoiser's input takes the place of x, from which w then has x back.
-        let sign = if self.params.convention == Convention::PaperCode { -1.0 / w_scale } else { 1.0 };
         if let Some(w) = w {
-            Zip::from(&mut *x).and(&*w).par_for_each(|x, &w| *x += sign * w);
+            Zip::from(&mut *x).and(&*w).par_for_each(|x, &w| *x += w_factor * w);
         }
         self.denoiser.denoise(cx, x.view(), v.view_mut())?;
         if let Some(w) = w {
-            Zip::from(w).and(&*x).and(&*v).par_for_each(|w, &x, &v| *w += (x - sign * *w) - v);
+            Zip::from(w).and(&*x).and(&*v).par_for_each(|w, &x, &v| *w += (x - w_factor * *w) - v);
         }
         std::mem::swap(previous, theta);
         mosaic_into(self.cfa, v.view(), theta.view_mut());
