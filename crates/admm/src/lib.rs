@@ -22,6 +22,7 @@
 mod admm;
 mod color;
 mod gap;
+mod guard;
 mod lanes;
 mod observer;
 mod prior;

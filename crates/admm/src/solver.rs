@@ -1,5 +1,6 @@
 //! The one loop that drives every solver.
 
+use crate::guard::Guard;
 use crate::{BoxError, DenoiseCx, IterInfo, Observer, Plan, Problem, Start};
 use ndarray::{Array3, Array4, ArrayView3, ArrayView4};
 use sci_forward::Progress;
@@ -57,7 +58,8 @@ pub enum StopReason {
     ScheduleDone,
     /// The relative change fell to the tolerance.
     Converged,
-    /// A value was not finite or the residual exploded; the outcome holds the iterate before.
+    /// A value was not finite, the residual exploded, or what came out cannot be a scene: it explains the measurement worse than
+    /// a black video, or is far brighter than it. The outcome holds the iterate that explains the measurement best.
     Diverged,
     /// The time limit passed.
     TimeUp,
@@ -99,7 +101,7 @@ pub trait Solver {
 pub struct Outcome<S> {
     /// The last state of the solver (after a divergence, the diverged one).
     pub state: S,
-    /// The estimate `[T, H, W]`, always finite: after a divergence the last good one.
+    /// The estimate `[T, H, W]`, always finite: after a divergence the one that explains the measurement best.
     pub estimate: Array3<f32>,
     /// The RGB estimate `[T, 3, H, W]` of a color solver that belongs to `estimate`; nothing after a divergence.
     pub rgb: Option<Array4<f32>>,
@@ -128,12 +130,14 @@ pub fn run<S: Solver>(
     let start = start.video(problem)?;
     let mut relative_residual =
         relative(problem.operator().progress(problem.y(), start.view(), start.view()), problem).0;
+    let mut guard = Guard::new(problem, relative_residual, plan.stop.diverged_above);
     let mut state = solver.init(problem, start);
     clock.pause();
     observer.begin(plan).map_err(|source| SolveError::Observer { iteration: 0, source })?;
 
     let mut iterations = 0;
     let mut stop = StopReason::ScheduleDone;
+    let mut last = Progress::default();
     'stages: for (stage, &crate::Stage { sigma, iterations: count }) in plan.stages.iter().enumerate() {
         for _ in 0..count {
             clock.resume();
@@ -150,12 +154,11 @@ pub fn run<S: Solver>(
             clock.pause();
 
             let (residual, relative_change) = relative(progress, problem);
-            let good = residual <= plan.stop.diverged_above && relative_change.is_finite();
-            if !good || !rgb_is_finite {
+            if !rgb_is_finite || !guard.admit(residual, relative_change, solver.previous(&state)) {
                 stop = StopReason::Diverged;
                 break 'stages;
             }
-            relative_residual = residual;
+            (relative_residual, last) = (residual, progress);
             let seconds = clock.elapsed().as_secs_f64();
             let info = IterInfo { iteration, stage, sigma, estimate, rgb, relative_residual, relative_change, seconds };
             stop = match observer.iteration(&info).map_err(|source| SolveError::Observer { iteration, source })? {
@@ -168,7 +171,17 @@ pub fn run<S: Solver>(
         }
     }
     let (estimate, rgb) = match stop {
-        StopReason::Diverged => (solver.previous(&state).to_owned(), None),
+        StopReason::Diverged => {
+            let (estimate, residual) = guard.best(solver.previous(&state));
+            relative_residual = residual;
+            (estimate, None)
+        }
+        StopReason::ScheduleDone | StopReason::Converged if !guard.is_result(relative_residual, last) => {
+            stop = StopReason::Diverged;
+            let (estimate, residual) = guard.best(solver.estimate(&state));
+            relative_residual = residual;
+            (estimate, None)
+        }
         _ => (solver.estimate(&state).to_owned(), solver.rgb(&state).map(|rgb| rgb.to_owned())),
     };
     let seconds = clock.elapsed().as_secs_f64();

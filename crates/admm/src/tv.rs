@@ -98,9 +98,9 @@ impl Tv {
     /// TV of this weight.
     ///
     /// # Panics
-    /// If the weight is not positive and finite.
+    /// If the weight is not positive, is not finite, or is so small that its inverse is not.
     pub fn new(weight: f32) -> Self {
-        assert!(weight > 0.0 && weight.is_finite(), "TV weight {weight} must be finite and greater than 0");
+        assert!(weight > 0.0 && weight.is_normal(), "TV weight {weight} must be finite and greater than 1.2e-38");
         let sweep = Sweep::available()[0];
         Self { weight, inner: 5, sweep, scratch: Vec::new() }
     }

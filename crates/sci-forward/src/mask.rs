@@ -1,6 +1,7 @@
 //! Mask stacks: validated once, so that no operator or solver has to ask again.
 
 use crate::VideoShape;
+use crate::operator::CLOSED;
 use ndarray::{Array2, Array3, ArrayView3, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -21,9 +22,9 @@ pub enum MaskError {
         /// W.
         width: usize,
     },
-    /// A transmittance is negative, NaN or infinite.
+    /// A transmittance is negative, NaN, or too large for the sums of its square.
     #[error(
-        "mask value {value} at frame {frame}, row {row}, column {column}: a transmittance must be finite and at least 0"
+        "mask value {value} at frame {frame}, row {row}, column {column}: a transmittance must be in 0 to {MAX_TRANSMITTANCE:e}"
     )]
     Value {
         /// The offending value.
@@ -35,15 +36,18 @@ pub enum MaskError {
         /// Its column.
         column: usize,
     },
-    /// No pixel of any mask is open.
-    #[error("every mask is zero everywhere: nothing reaches the sensor")]
+    /// No pixel of any mask is open by more than rounding errors.
+    #[error("every mask is zero everywhere (or below 1e-15): nothing reaches the sensor")]
     AllClosed,
     /// A density outside `(0, 1]`.
     #[error("mask density {0} is outside (0, 1]")]
     Density(f64),
 }
 
-/// `T` masks `C_t` `[T, H, W]`: finite transmittances of at least 0, binary or calibrated, at least one of them open.
+/// The largest transmittance, in whatever unit: squares of measurements stay in the range of `f32`.
+const MAX_TRANSMITTANCE: f32 = 1e9;
+
+/// `T` masks `C_t` `[T, H, W]`: transmittances from 0 to 1e9, binary or calibrated in any unit, at least one of them open.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskStack {
     masks: Array3<f32>,
@@ -53,7 +57,7 @@ impl MaskStack {
     /// Checks and takes masks `[T, H, W]`.
     ///
     /// # Errors
-    /// [`MaskError`] if a dimension is zero, a value is negative or not finite, or every value is 0.
+    /// [`MaskError`] if a dimension is zero, a value is out of range, or every value is 0.
     ///
     /// ```
     /// use ndarray::array;
@@ -65,11 +69,12 @@ impl MaskStack {
         if frames * height * width == 0 {
             return Err(MaskError::Empty { frames, height, width });
         }
-        if let Some(((frame, row, column), &value)) = masks.indexed_iter().find(|(_, v)| !(v.is_finite() && **v >= 0.0))
+        if let Some(((frame, row, column), &value)) =
+            masks.indexed_iter().find(|(_, v)| !(0.0..=MAX_TRANSMITTANCE).contains(*v))
         {
             return Err(MaskError::Value { value, frame, row, column });
         }
-        if masks.iter().all(|&v| v == 0.0) {
+        if masks.iter().all(|&v| v * v <= CLOSED) {
             return Err(MaskError::AllClosed);
         }
         let masks = if masks.is_standard_layout() { masks } else { masks.as_standard_layout().into_owned() };
@@ -126,7 +131,8 @@ impl MaskStack {
     /// The masks with every transmittance of the pixels where `measured` `[H, W]` is false set to 0.
     ///
     /// To the operator such a pixel is one that no mask opens: it takes no part in the data step. Dead pixels
-    /// and pixels held out for validation are handled this way.
+    /// and pixels held out for validation are handled this way. What the measurement holds there counts as residual, so it is
+    /// best set to 0.
     ///
     /// # Errors
     /// [`MaskError::AllClosed`] if nothing stays open.

@@ -1,0 +1,397 @@
+//! Every solver on inputs that no one should have, and on some that everyone has: each case must end with a finite result
+//! that explains the measurement, or as `Diverged`; never with a panic, a NaN or a garbage video without a word.
+//!
+//! The table is printed one JSON object a line, which `cargo xtask stress` renders.
+
+use admm::*;
+use ndarray::{Array2, Array3, ArrayView4, ArrayViewMut4, Axis};
+use sci_forward::bayer::{CfaPattern, Malvar};
+use sci_forward::metrics::{mean_over_frames, psnr};
+use sci_forward::testing::{gaussian, moving_square, uniform};
+use sci_forward::{MaskOperator, MaskStack, Noise, SensingOperator, VideoShape};
+
+const SHAPE: VideoShape = VideoShape { frames: 8, height: 32, width: 36 };
+
+/// Pulls every frame towards its mean, the more the greater σ: a prior whose strength is σ.
+struct Flatten;
+
+impl Denoiser for Flatten {
+    fn name(&self) -> &str {
+        "flatten"
+    }
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        x: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        let pull = cx.sigma / (1.0 + cx.sigma);
+        for (x, mut out) in x.outer_iter().zip(out.outer_iter_mut()) {
+            let mean = x.mean().unwrap_or(0.0);
+            out.zip_mut_with(&x, |out, &x| *out = x + pull * (mean - x));
+        }
+        Ok(())
+    }
+}
+
+/// A prior, fresh for each run.
+type Prior = Box<dyn Fn() -> Box<dyn Denoiser>>;
+
+fn tv(weight: f32) -> Prior {
+    Box::new(move || Box::new(Tv::new(weight)))
+}
+
+type Disturb = Box<dyn Fn(&mut Array2<f32>)>;
+
+/// What is solved, and how.
+struct Case {
+    name: String,
+    masks: Result<MaskStack, sci_forward::MaskError>,
+    truth: Array3<f32>,
+    /// What happens to the measurement on its way.
+    disturb: Disturb,
+    start: From,
+    prior: Prior,
+    params: Params,
+    plan: Plan,
+    /// PSNR in dB below which a result is garbage, with the truth's peak as white.
+    at_least: f64,
+}
+
+#[derive(Clone, Copy)]
+enum From {
+    Mean,
+    Adjoint,
+    Constant(f32),
+    Random,
+}
+
+#[derive(Clone, Copy)]
+struct Params {
+    rho: f32,
+    tau: f32,
+    alpha: f32,
+    gamma: f32,
+}
+
+impl Case {
+    /// Nothing unusual: the base that every case changes one thing of.
+    fn base(name: impl Into<String>, shape: VideoShape) -> Self {
+        Self {
+            name: name.into(),
+            masks: MaskStack::random(shape, 0.5, 3),
+            truth: moving_square(shape),
+            disturb: Box::new(|_| ()),
+            start: From::Mean,
+            prior: tv(0.1),
+            params: Params { rho: 1.0, tau: 100.0, alpha: 1.0, gamma: 0.01 },
+            plan: Plan::new([Stage { sigma: 0.05, iterations: 40 }]),
+            at_least: 5.0,
+        }
+    }
+
+    fn masks(mut self, masks: Array3<f32>) -> Self {
+        self.masks = MaskStack::new(masks);
+        self
+    }
+
+    /// Nothing can be asked of the result's PSNR then.
+    fn disturb(mut self, disturb: impl Fn(&mut Array2<f32>) + 'static) -> Self {
+        self.disturb = Box::new(disturb);
+        self.at_least = f64::NEG_INFINITY;
+        self
+    }
+
+    /// As good as if nothing had been unusual.
+    fn harmless(mut self) -> Self {
+        self.at_least = 15.0;
+        self
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Which {
+    GapPlain,
+    Gap,
+    GapReference,
+    Admm,
+    TwoStage,
+    TwoStageScaled,
+    ClosedForm,
+}
+
+const SOLVERS: [(Which, &str); 7] = [
+    (Which::GapPlain, "GAP"),
+    (Which::Gap, "GAP accelerated"),
+    (Which::GapReference, "GAP reference"),
+    (Which::Admm, "ADMM"),
+    (Which::TwoStage, "two-stage"),
+    (Which::TwoStageScaled, "two-stage scaled"),
+    (Which::ClosedForm, "two-stage CFD"),
+];
+
+/// How a case ended.
+#[derive(Debug, Clone, PartialEq)]
+enum Ending {
+    Result { psnr: f64, residual: f64 },
+    Diverged { iteration: usize },
+    Refused(String),
+    Fault(String),
+}
+
+impl Ending {
+    fn cell(&self) -> String {
+        match self {
+            Self::Result { psnr, residual } if psnr.is_infinite() => format!("exact, {residual:.1e}"),
+            Self::Result { psnr, residual } => format!("{psnr:.1} dB, {residual:.1e}"),
+            Self::Diverged { iteration } => format!("diverged at {iteration}"),
+            Self::Refused(why) => format!("refused: {why}"),
+            Self::Fault(why) => format!("FAULT: {why}"),
+        }
+    }
+}
+
+fn solve(case: &Case, which: Which) -> Ending {
+    let quiet = std::panic::AssertUnwindSafe(|| attempt(case, which));
+    std::panic::catch_unwind(quiet).unwrap_or_else(|_| Ending::Fault("panicked".into()))
+}
+
+fn attempt(case: &Case, which: Which) -> Ending {
+    let h = match &case.masks {
+        Ok(masks) => MaskOperator::new(masks.clone()),
+        Err(e) => return Ending::Refused(e.to_string()),
+    };
+    let mut y = h.forward(case.truth.view());
+    (case.disturb)(&mut y);
+    match recover(case, which, &h, &y) {
+        Err(e) => Ending::Refused(std::error::Error::source(&e).map_or(e.to_string(), |s| format!("{e}: {s}"))),
+        Ok(recovered) => judge(case, recovered),
+    }
+}
+
+fn judge(case: &Case, (estimate, stop, iterations, residual): Recovered) -> Ending {
+    if let Some(v) = estimate.iter().find(|v| !v.is_finite()) {
+        return Ending::Fault(format!("{v} in the estimate"));
+    }
+    if stop == StopReason::Diverged {
+        return Ending::Diverged { iteration: iterations - 1 };
+    }
+    if residual.is_nan() || residual > 1.0 {
+        return Ending::Fault(format!("residual {residual:.1e}: a black video explains the measurement better"));
+    }
+    let white = case.truth.iter().fold(0f32, |m, &v| m.max(v));
+    let psnr = mean_over_frames((&case.truth / white).view(), (&estimate / white).view(), psnr);
+    if psnr < case.at_least {
+        return Ending::Fault(format!("{psnr:.1} dB, not {:.1}", case.at_least));
+    }
+    Ending::Result { psnr, residual }
+}
+
+type Recovered = (Array3<f32>, StopReason, usize, f64);
+
+fn recover(case: &Case, which: Which, h: &MaskOperator, y: &Array2<f32>) -> Result<Recovered, SolveError> {
+    let problem = Problem::new(h, y.view())?;
+    let given = match case.start {
+        From::Constant(v) => Array3::from_elem(case.truth.dim(), v),
+        _ => gaussian(case.truth.dim(), 5),
+    };
+    let start = match case.start {
+        From::Mean => Start::Mean,
+        From::Adjoint => Start::Adjoint,
+        From::Constant(_) | From::Random => Start::From(given.view()),
+    };
+    let Params { rho, tau, alpha, gamma } = case.params;
+    let two_stage = |convention, x_step| {
+        let params = TwoStageParams { rho, tau, alpha, convention };
+        TwoStage::new((case.prior)(), Malvar, x_step, CfaPattern::Rggb, params)
+    };
+    let prior = (case.prior)();
+    match which {
+        Which::GapPlain => finish(&mut Gap::plain(prior), &problem, start, &case.plan),
+        Which::Gap => finish(&mut Gap::accelerated(prior), &problem, start, &case.plan),
+        Which::GapReference => finish(&mut Gap::with_momentum(prior, MomentumStart::Zero), &problem, start, &case.plan),
+        Which::Admm => finish(&mut Admm::new(prior, gamma), &problem, start, &case.plan),
+        Which::TwoStage => finish(&mut two_stage(Convention::PaperCode, XStep::Demosaic), &problem, start, &case.plan),
+        Which::TwoStageScaled => {
+            finish(&mut two_stage(Convention::Scaled, XStep::Demosaic), &problem, start, &case.plan)
+        }
+        Which::ClosedForm => {
+            let x_step = XStep::ClosedForm { clip: true };
+            finish(&mut two_stage(Convention::PaperCode, x_step), &problem, start, &case.plan)
+        }
+    }
+}
+
+fn finish<S: Solver>(s: &mut S, problem: &Problem<'_>, start: Start<'_>, plan: &Plan) -> Result<Recovered, SolveError> {
+    let outcome = run(s, problem, start, plan, &mut ())?;
+    Ok((outcome.estimate, outcome.stop, outcome.iterations, outcome.relative_residual))
+}
+
+/// Runs every case with every solver, prints the table, and fails if there is a fault in it.
+fn check(group: &str, cases: Vec<Case>) {
+    let mut faults = Vec::new();
+    for case in cases {
+        for (which, solver) in SOLVERS {
+            let ending = solve(&case, which);
+            let cell = ending.cell().replace('"', "'");
+            println!(r#"{{"group":"{group}","case":"{}","solver":"{solver}","outcome":"{cell}"}}"#, case.name);
+            if let Ending::Fault(why) = ending {
+                faults.push(format!("{group} / {} / {solver}: {why}", case.name));
+            }
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}
+
+#[test]
+fn masks() {
+    let base = |name: &str| Case::base(name, SHAPE);
+    let random = uniform(SHAPE.dim(), 9);
+    let mut one_frame = Array3::zeros(SHAPE.dim());
+    one_frame.index_axis_mut(Axis(0), 2).fill(1.0);
+    let first = random.index_axis(Axis(0), 0).mapv(f32::round);
+    let mut spike = random.mapv(|v| 0.1 + 0.9 * v);
+    spike[[3, 5, 7]] = 1e6;
+    check(
+        "masks",
+        vec![
+            base("all 0").masks(Array3::zeros(SHAPE.dim())),
+            base("all 1").masks(Array3::ones(SHAPE.dim())),
+            base("one frame open").masks(one_frame),
+            base("the same in every frame").masks(first.broadcast(SHAPE.dim()).unwrap().to_owned()),
+            base("float in [0, 1e-6]").masks(&random * 1e-6),
+            base("float, one pixel 1e6").masks(spike),
+            base("float in [0, 1e-20]").masks(&random * 1e-20),
+            base("float up to 1e25").masks(&random * 1e25),
+        ],
+    );
+}
+
+#[test]
+fn sizes() {
+    let sizes = [(1, 32, 36), (2, 32, 36), (64, 16, 18), (8, 2, 2), (8, 3, 3), (8, 1, 4096), (8, 4096, 1), (2, 1, 1)];
+    let case = |(frames, height, width)| {
+        let masks = MaskStack::random(VideoShape { frames, height, width }, 0.5, 3);
+        let mut case = Case::base(format!("{frames} × {height}×{width}"), VideoShape { frames, height, width });
+        case.masks = masks.or(MaskStack::new(Array3::ones((frames, height, width))));
+        case
+    };
+    check("size", sizes.into_iter().map(case).collect());
+}
+
+#[test]
+fn measurements() {
+    let base = |name: &str| Case::base(name, SHAPE);
+    let pixels =
+        |value: f32| move |y: &mut Array2<f32>| (0..12).for_each(|k| y[[(7 * k + 3) % 32, (11 * k + 5) % 36]] = value);
+    let noise = |decibels: i32| {
+        move |y: &mut Array2<f32>| {
+            let power = y.mapv(|v| v * v).mean().unwrap();
+            let sigma = (power / 10f32.powf(decibels as f32 / 10.0)).sqrt();
+            *y = Noise::Gaussian { sigma: f64::from(sigma) }.apply(y.view(), 4).unwrap();
+        }
+    };
+    let photons = |photons: f64| move |y: &mut Array2<f32>| *y = Noise::Poisson { photons }.apply(y.view(), 4).unwrap();
+    check(
+        "measurement",
+        vec![
+            base("black").disturb(|y| y.fill(0.0)),
+            base("saturated at 1.5").disturb(|y| y.mapv_inplace(|v| v.min(1.5))),
+            base("12 dead pixels").disturb(pixels(0.0)),
+            base("12 hot pixels").disturb(pixels(8.0)),
+            base("12 pixels at 1e6").disturb(pixels(1e6)),
+            base("12 pixels at 1e30").disturb(pixels(1e30)),
+            base("12 NaN pixels").disturb(pixels(f32::NAN)),
+            base("Gaussian noise, 20 dB").disturb(noise(20)),
+            base("Gaussian noise, 0 dB").disturb(noise(0)),
+            base("100 photons").disturb(photons(100.0)),
+            base("1 photon").disturb(photons(1.0)),
+            base("negative").disturb(|y| y.mapv_inplace(|v| -v)),
+        ],
+    );
+}
+
+/// Dead, hot and NaN pixels that are taken out of the masks do no harm.
+#[test]
+fn unmeasured_pixels() {
+    let mut cases = Vec::new();
+    for (name, value) in [("dead", 0.0), ("hot", 8.0), ("NaN", f32::NAN)] {
+        let mut measured = Array2::from_elem(SHAPE.image_dim(), true);
+        let bad: Vec<(usize, usize)> = (0..12).map(|k| ((7 * k + 3) % 32, (11 * k + 5) % 36)).collect();
+        bad.iter().for_each(|&at| measured[at] = false);
+        let mut case = Case::base(format!("12 {name} pixels, unmeasured"), SHAPE);
+        case.masks = case.masks.unwrap().restricted_to(measured.view());
+        let case = case.disturb(move |y| {
+            // A pixel that is not measured may hold anything finite; a NaN is replaced on reading.
+            bad.iter().for_each(|&at| y[at] = if f32::is_nan(value) { 0.0 } else { value });
+        });
+        cases.push(case.harmless());
+    }
+    check("unmeasured", cases);
+}
+
+#[test]
+fn parameters() {
+    let mut cases = Vec::new();
+    for v in [1e-8, 1e-4, 1e4, 1e8] {
+        let base = |what: &str| Case::base(format!("{what} {v:.0e}"), SHAPE);
+        let params = base("").params;
+        cases.push(Case { prior: tv(v), ..base("TV weight") });
+        cases.push(Case { params: Params { gamma: v, ..params }, ..base("γ") });
+        cases.push(Case { params: Params { rho: v, ..params }, ..base("ρ") });
+        cases.push(Case { params: Params { tau: v, ..params }, ..base("τ") });
+        cases.push(Case { params: Params { alpha: v, ..params }, ..base("α") });
+        let plan = Plan::new([Stage { sigma: v, iterations: 40 }]);
+        cases.push(Case { prior: Box::new(|| Box::new(Flatten)), plan, ..base("σ") });
+    }
+    check("parameter", cases);
+}
+
+#[test]
+fn long_runs_and_odd_starts() {
+    let base = |name: &str| Case::base(name, SHAPE);
+    let from = |name: &str, start| Case { start, ..base(name) };
+    check(
+        "run",
+        vec![
+            base("nothing unusual").harmless(),
+            Case { plan: Plan::new([Stage { sigma: 0.05, iterations: 2000 }]), ..base("2,000 iterations") },
+            Case { plan: Plan::new([]), ..base("no iteration") },
+            from("start adjoint", From::Adjoint),
+            from("start 0", From::Constant(0.0)),
+            from("start 100", From::Constant(100.0)),
+            from("start 1e8", From::Constant(1e8)),
+            from("start 1e30", From::Constant(1e30)),
+            from("start random", From::Random),
+        ],
+    );
+}
+
+/// A measurement `s` times as large, with priors `s` times as strong, gives the video times `s`.
+#[test]
+fn scales() {
+    let solvers = &SOLVERS[..4];
+    let mut faults = Vec::new();
+    for (which, solver) in solvers {
+        let estimate = |scale: f32| {
+            let case = Case { prior: tv(0.1 * scale), ..Case::base("", SHAPE) };
+            let h = MaskOperator::new(case.masks.clone().unwrap());
+            let y = h.forward(case.truth.view()) * scale;
+            let (estimate, stop, ..) = recover(&case, *which, &h, &y).unwrap();
+            assert_eq!(stop, StopReason::ScheduleDone);
+            estimate / scale
+        };
+        let one = estimate(1.0);
+        for exponent in [-8, -4, 4, 8] {
+            let off = (&one - estimate(10f32.powi(exponent))).fold(0f32, |m, d| m.max(d.abs()));
+            let outcome = format!("off by {off:.1e}");
+            println!(
+                r#"{{"group":"scale","case":"y × 1e{exponent}, weight too","solver":"{solver}","outcome":"{outcome}"}}"#
+            );
+            if off > 1e-4 {
+                faults.push(format!("{solver} × 1e{exponent}: {outcome}"));
+            }
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}
