@@ -87,7 +87,6 @@ fn configs_resolve_or_name_what_is_missing() {
         let run = bench.finish(command.arg(&path).env("SCI_DATA", &root));
         assert_eq!(run.code, 2, "{name}: {}", run.stderr);
         let expected: &[&str] = match () {
-            _ if name.contains("online") => &["`online.enabled` = true is not available yet"],
             _ if name.contains("ddnet") || name.contains("fastdvdnet") => &["bundled:", "`data.measurements` names 9"],
             _ => &["`data.measurements` names 9"],
         };

@@ -146,13 +146,27 @@ fn not_toml() {
 
 #[test]
 fn what_is_not_there_yet_is_refused() {
-    for (argument, key) in [
-        ("online.enabled=true", "`online.enabled` = true"),
-        ("skip.enabled=true", "`skip.enabled` = true"),
-        ("denoiser.kind=wnnm", "`denoiser.kind` = wnnm"),
-    ] {
+    for (argument, key) in
+        [("skip.enabled=true", "`skip.enabled` = true"), ("denoiser.kind=wnnm", "`denoiser.kind` = wnnm")]
+    {
         fails(&bench(), &["--set", argument], 2, &[&format!("--set {argument}"), key, "not available yet"]);
     }
+}
+
+#[test]
+fn settings_of_adaptation_are_checked() {
+    for (argument, needles) in [
+        ("online.interval=0", ["`online.interval` = 0", "1 to 100000"]),
+        ("online.learning_rate=0", ["`online.learning_rate` = 0", "to 1"]),
+        ("online.reuse=keep", ["`online.reuse` = keep", "reset, carry-over"]),
+        ("online.parameters=none", ["`online.parameters` = none", "all, biases"]),
+        ("online.intervall=3", ["unknown key `online.intervall`", "did you mean `interval`"]),
+        ("online.enabled=true", ["[online] has no effect", "no stage has a network"]),
+    ] {
+        fails(&bench(), &["--set", argument], 2, &needles);
+    }
+    let both = ["--set", "online.held_out=0.5", "--set", "online.blind=0.5"];
+    fails(&bench(), &both, 2, &["`online`", "held_out", "0.9"]);
 }
 
 #[test]

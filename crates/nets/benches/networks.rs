@@ -4,7 +4,7 @@ use admm::{DenoiseCx, Denoiser};
 use criterion::{Criterion, criterion_group, criterion_main};
 use ndarray::Array4;
 use nets::train::{
-    CheckpointConfig, DataConfig, Frame, Loss, NetworkConfig, NoiseConfig, TrainConfig, TrainData, Trainer,
+    CheckpointConfig, DataConfig, Frame, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainData, Trainer,
     TrainingConfig, ValidationConfig,
 };
 use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec};
@@ -43,6 +43,7 @@ fn training(c: &mut Criterion) {
         noise: NoiseConfig { sigma: [0.0, 75.0] },
         training: TrainingConfig {
             steps: u64::MAX,
+            optimizer: Optimizer::Muon,
             loss: Loss::L1,
             learning_rate: 1e-3,
             final_learning_rate: 0.0,

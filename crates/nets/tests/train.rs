@@ -36,6 +36,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
         noise: NoiseConfig { sigma: [0.0, 50.0] },
         training: TrainingConfig {
             steps,
+            optimizer: Optimizer::Muon,
             loss: Loss::L1,
             learning_rate: 2e-3,
             final_learning_rate: 0.0,

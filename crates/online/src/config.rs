@@ -73,8 +73,14 @@ impl Default for AdaptConfig {
     /// Where weights are carried over only the first measurement of a scene updates: with updates in each of them
     /// *traffic* lost 0.1, 0.6, 1.4 dB in measurements 2 to 4 while the loss fell, at the pixels held out too.
     fn default() -> Self {
-        let schedule =
-            Schedule { interval: 3, max_updates: Some(2), steps: 1, learning_rate: 3e-6, ..Schedule::PAPER_FFDNET };
+        let schedule = Schedule {
+            interval: 3,
+            max_updates: Some(2),
+            steps: 1,
+            learning_rate: 3e-6,
+            growth: 100.0,
+            ..Schedule::PAPER_FFDNET
+        };
         Self { schedule, guard: Guard::ON, ..Self::PAPER_FFDNET }
     }
 }

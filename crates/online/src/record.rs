@@ -1,10 +1,10 @@
 //! What updates did.
 
 use crate::SplitLoss;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Why an update was undone.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RollBack {
     /// The loss, a gradient or the new output was not finite.
@@ -16,7 +16,7 @@ pub enum RollBack {
 }
 
 /// What became of an update that was due.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The new weights are in use.
@@ -28,7 +28,7 @@ pub enum Outcome {
 }
 
 /// An update that was due.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Update {
     /// The measurement of the sequence, from 0.
     pub measurement: usize,
@@ -60,7 +60,7 @@ impl Update {
 }
 
 /// How many of which kind.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// Tried: kept or rolled back.
     pub fired: usize,

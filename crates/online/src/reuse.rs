@@ -16,7 +16,7 @@ pub enum Reuse {
 }
 
 /// How well the previous result explains the new measurement, as relative residuals `‖y − H x‖ / ‖y‖`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Relation {
     /// Of the previous result, arranged as it fits best.
     pub previous: f64,

@@ -2,7 +2,7 @@
 
 use crate::reuse::continuation;
 use crate::{AdaptiveDenoiser, Error, Relation, Result, Reuse, Similarity, Snapshot, Update};
-use admm::{Denoiser, Plan, SolveError, Stage, Start};
+use admm::{Denoiser, Plan, SolveError, Start};
 use ndarray::{Array3, ArrayView3};
 use nets::Network;
 
@@ -36,6 +36,8 @@ pub struct Task {
     pub cut: bool,
     /// The share of the iterations that it needs, in `(0, 1]`.
     pub effort: f64,
+    /// Whether denoisers begin with their pretrained weights: under [`Reuse::Reset`] and after a cut.
+    pub fresh: bool,
     warm: Option<Array3<f32>>,
 }
 
@@ -51,18 +53,26 @@ impl Task {
     }
 
     /// The last `effort · iterations` iterations of a plan, rounded up: the first ones only find what is known already.
+    /// Stages keep their numbers; those that are not needed have no iterations.
     pub fn plan(&self, plan: &Plan) -> Plan {
         let mut left = (self.effort * plan.iterations() as f64).ceil() as usize;
-        let mut stages: Vec<Stage> = Vec::new();
-        for stage in plan.stages.iter().rev() {
-            let iterations = stage.iterations.min(left);
-            left -= iterations;
-            if iterations > 0 {
-                stages.push(Stage { iterations, ..*stage });
-            }
+        let mut plan = plan.clone();
+        for stage in plan.stages.iter_mut().rev() {
+            stage.iterations = stage.iterations.min(left);
+            left -= stage.iterations;
         }
-        stages.reverse();
-        Plan { stages, stop: plan.stop }
+        plan
+    }
+
+    /// Turns a denoiser to this measurement, with the weights that it is to begin with.
+    ///
+    /// # Errors
+    /// As [`AdaptiveDenoiser::bind`].
+    pub fn prepare<N: Network + Denoiser>(&self, denoiser: &mut AdaptiveDenoiser<N>) -> Result<()> {
+        if self.fresh {
+            denoiser.reset()?;
+        }
+        denoiser.bind(self.snapshot.clone())
     }
 }
 
@@ -92,15 +102,8 @@ impl Sequence {
         Ok(Self { config, previous: None, index: 0 })
     }
 
-    /// Prepares the denoiser for the next measurement: under [`Reuse::Reset`] and after a cut with pretrained weights.
-    ///
-    /// # Errors
-    /// As [`AdaptiveDenoiser::bind`].
-    pub fn begin<N: Network + Denoiser>(
-        &mut self,
-        denoiser: &mut AdaptiveDenoiser<N>,
-        snapshot: Snapshot,
-    ) -> Result<Task> {
+    /// What is to be done with the next measurement; [`Task::prepare`] readies each denoiser for it.
+    pub fn begin(&mut self, snapshot: Snapshot) -> Task {
         let (index, similarity) = (self.index, self.config.similarity);
         self.index += 1;
         let usable = |video: &Array3<f32>| video.dim() == snapshot.shape().dim() && video.iter().all(|v| v.is_finite());
@@ -109,13 +112,10 @@ impl Sequence {
         let relation = known.as_ref().map(|(_, relation)| *relation);
         let cut = relation.is_some_and(|relation| relation.of_scene() > similarity.cut);
         let within = |limit: f64| !cut && relation.is_some_and(|relation| relation.of_start() <= limit);
-        if cut || self.config.reuse == Reuse::Reset {
-            denoiser.reset()?;
-        }
-        denoiser.bind(snapshot.clone())?;
+        let fresh = cut || self.config.reuse == Reuse::Reset;
         let effort = if within(similarity.unchanged) { self.config.effort } else { 1.0 };
         let warm = known.filter(|_| within(similarity.warm)).map(|(video, _)| video);
-        Ok(Task { index, snapshot, relation, cut, effort, warm })
+        Task { index, snapshot, relation, cut, effort, fresh, warm }
     }
 
     /// Hands in the result `[T, H, W]` of the measurement that was begun last.
@@ -153,7 +153,8 @@ pub fn run_sequence<N: Network + Denoiser, S>(
     let mut sequence = Sequence::new(config)?;
     let mut solved = Vec::new();
     for snapshot in snapshots {
-        let task = sequence.begin(denoiser, snapshot)?;
+        let task = sequence.begin(snapshot);
+        task.prepare(denoiser)?;
         let before = denoiser.updates().len();
         let outcome =
             solve(denoiser, &task).map_err(|source| Error::Solve { index: task.index, source: Box::new(source) })?;

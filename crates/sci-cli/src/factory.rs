@@ -12,11 +12,14 @@ use admm::{
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
 use nets::Network;
+use online::{AdaptiveDenoiser, Counts, Sequence, Snapshot, Task, Update};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer};
 
 use crate::config::check::{Momentum, Solver, Start as StartChoice};
-use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment};
+use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment, Online};
+use crate::io::scene::Scene;
+use crate::record::Adaptation;
 
 /// Builds the solvers of one experiment.
 pub struct Factory<'e> {
@@ -24,6 +27,7 @@ pub struct Factory<'e> {
     parts: Vec<Part>,
     color: Option<Sensor>,
     plan: Plan,
+    sequence: Option<Sequence>,
 }
 
 /// A color sensor, and what demosaics it.
@@ -36,10 +40,28 @@ struct Sensor {
 enum Part {
     /// Built anew for each measurement, as it may carry state from call to call.
     Tv { weight: f32, inner: usize },
+    /// Loaded once. Without a measurement it is the network itself.
+    Ffdnet(AdaptiveDenoiser<nets::Ffdnet>),
     /// Loaded once.
-    Ffdnet(nets::Ffdnet),
-    /// Loaded once.
-    Fastdvdnet(nets::Fastdvdnet),
+    Fastdvdnet(AdaptiveDenoiser<nets::Fastdvdnet>),
+}
+
+impl Part {
+    fn prepare(&mut self, task: &Task) -> online::Result<()> {
+        match self {
+            Self::Tv { .. } => Ok(()),
+            Self::Ffdnet(net) => task.prepare(net),
+            Self::Fastdvdnet(net) => task.prepare(net),
+        }
+    }
+
+    fn updates(&self) -> &[Update] {
+        match self {
+            Self::Tv { .. } => &[],
+            Self::Ffdnet(net) => net.updates(),
+            Self::Fastdvdnet(net) => net.updates(),
+        }
+    }
 }
 
 impl<'e> Factory<'e> {
@@ -55,7 +77,8 @@ impl<'e> Factory<'e> {
             anyhow::ensure!(!two_stage, "solver.kind = \"two-stage\" is for color sensors: {gray}");
             anyhow::ensure!(experiment.demosaicer.is_none(), "solver.demosaicer has no effect: {gray}");
         }
-        let parts = experiment.denoisers.iter().map(|d| load(d, cfa)).collect::<anyhow::Result<_>>()?;
+        let parts =
+            experiment.denoisers.iter().map(|d| load(d, cfa, experiment.online)).collect::<anyhow::Result<_>>()?;
         let sensor = |cfa| anyhow::Ok(Sensor { cfa, demosaicer: demosaicer(experiment)? });
         let color = cfa.map(sensor).transpose()?;
         let stages: Vec<admm::Stage> =
@@ -66,7 +89,8 @@ impl<'e> Factory<'e> {
             time: experiment.seconds.map(Duration::from_secs_f64),
             ..StopRule::default()
         };
-        Ok(Self { experiment, parts, color, plan })
+        let sequence = experiment.online.map(|o| Sequence::new(o.sequence)).transpose()?;
+        Ok(Self { experiment, parts, color, plan, sequence })
     }
 
     /// The stages and the stop rule.
@@ -74,24 +98,63 @@ impl<'e> Factory<'e> {
         &self.plan
     }
 
-    /// Solves one measurement; `previous` is the result of the one before.
+    /// Solves measurement `k`; `previous` is the result of the one before.
     ///
     /// # Errors
-    /// What [`admm::run`] reports.
+    /// What [`admm::run`] and the adaptation report.
     pub fn solve(
         &mut self,
-        problem: &Problem<'_>,
+        scene: &Scene,
+        k: usize,
         previous: Option<ArrayView3<'_, f32>>,
         observer: &mut dyn Observer,
-    ) -> Result<Solved, SolveError> {
+    ) -> anyhow::Result<Solved> {
+        let task = self.begin(scene, k)?;
+        let done: Vec<usize> = self.parts.iter().map(|part| part.updates().len()).collect();
+        let normal = start(self.experiment.start, self.color.is_some(), previous);
+        let (start, plan) = match &task {
+            Some(task) => (task.start(normal), task.plan(&self.plan)),
+            None => (normal, self.plan.clone()),
+        };
+        let problem = Problem::new(scene.operator.as_ref(), scene.measurement(k))?;
+        let (outcome, denoiser_calls) = self.run(&problem, start, &plan, observer)?;
+        if let Some(sequence) = &mut self.sequence {
+            sequence.finish(outcome.estimate.view());
+        }
+        let new = self.parts.iter().zip(done).flat_map(|(part, done)| &part.updates()[done..]);
+        let updates: Vec<Update> = new.copied().collect();
+        let adaptation = task.map(|task| Adaptation {
+            relation: task.relation,
+            warm_start: task.is_warm(),
+            cut: task.cut,
+            counts: Counts::of(&updates),
+            updates,
+        });
+        Ok(Solved { outcome, planned: plan.iterations(), denoiser_calls, adaptation })
+    }
+
+    /// What is known of a measurement from those before, where networks adapt; all of them turn to it.
+    fn begin(&mut self, scene: &Scene, k: usize) -> anyhow::Result<Option<Task>> {
+        let Some(sequence) = &mut self.sequence else { return Ok(None) };
+        let task = sequence.begin(Snapshot::new(scene.operator.clone(), scene.measurement(k), scene.cfa)?);
+        self.parts.iter_mut().try_for_each(|part| part.prepare(&task))?;
+        Ok(Some(task))
+    }
+
+    fn run(
+        &mut self,
+        problem: &Problem<'_>,
+        start: Start<'_>,
+        plan: &Plan,
+        observer: &mut dyn Observer,
+    ) -> Result<(Outcome<()>, usize), SolveError> {
         let calls = Rc::new(Cell::new(0));
         let color = self.color.as_ref();
         let denoiser = Counted { inner: denoiser(self.experiment, &mut self.parts, color), calls: Rc::clone(&calls) };
-        let start = start(self.experiment.start, color.is_some(), previous);
         let mut outcome = match (self.experiment.solver, color) {
             (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
                 let mut solver = TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params);
-                without_state(admm::run(&mut solver, problem, start, &self.plan, observer)?)
+                without_state(admm::run(&mut solver, problem, start, plan, observer)?)
             }
             (Solver::Gap { momentum }, _) => {
                 let mut gap = match momentum {
@@ -99,18 +162,35 @@ impl<'e> Factory<'e> {
                     Some(Momentum::Zero) => Gap::with_momentum(denoiser, MomentumStart::Zero),
                     Some(Momentum::Measurement) => Gap::with_momentum(denoiser, MomentumStart::Measurement),
                 };
-                without_state(admm::run(&mut gap, problem, start, &self.plan, observer)?)
+                without_state(admm::run(&mut gap, problem, start, plan, observer)?)
             }
             (Solver::Admm { gamma }, _) => {
                 let mut solver = Admm::new(denoiser, gamma);
-                without_state(admm::run(&mut solver, problem, start, &self.plan, observer)?)
+                without_state(admm::run(&mut solver, problem, start, plan, observer)?)
             }
             (Solver::TwoStage { .. }, None) => unreachable!("Factory::new refuses two-stage solvers for gray scenes"),
         };
         if let Some(sensor) = color {
             sensor.complete(&mut outcome)?;
         }
-        Ok(Solved { outcome, denoiser_calls: calls.get() })
+        Ok((outcome, calls.get()))
+    }
+
+    /// Writes the weights as they are now, of each network one file `adapted-N-KIND.safetensors`, N its place among the
+    /// denoisers.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn save_adapted(&self, dir: &Path) -> anyhow::Result<()> {
+        for (i, (part, choice)) in self.parts.iter().zip(&self.experiment.denoisers).enumerate() {
+            let path = dir.join(format!("adapted-{i}-{}.safetensors", choice.kind()));
+            match part {
+                Part::Tv { .. } => {}
+                Part::Ffdnet(net) => net.save(&path)?,
+                Part::Fastdvdnet(net) => net.save(&path)?,
+            }
+        }
+        Ok(())
     }
 }
 
@@ -158,8 +238,12 @@ fn boxed<'a>(denoiser: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
 pub struct Solved {
     /// The result; its state is dropped.
     pub outcome: Outcome<()>,
+    /// The iterations that were to be run.
+    pub planned: usize,
     /// Calls of the denoiser.
     pub denoiser_calls: usize,
+    /// How the denoiser adapted, where it was to.
+    pub adaptation: Option<Adaptation>,
 }
 
 fn without_state<S>(o: Outcome<S>) -> Outcome<()> {
@@ -176,7 +260,8 @@ fn start<'a>(choice: StartChoice, bayer: bool, previous: Option<ArrayView3<'a, f
     }
 }
 
-fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>) -> anyhow::Result<Part> {
+fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>) -> anyhow::Result<Part> {
+    let adapt = online.map(|o| o.adapt).unwrap_or_default();
     let fits = |net: &dyn Network, weights: &Path| {
         let (channels, (scene, needed)) = (net.channels(), if cfa.is_some() { ("color", 3) } else { ("gray", 1) });
         anyhow::ensure!(
@@ -191,12 +276,12 @@ fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>) -> anyhow::Result<Part
         DenoiserChoice::Ffdnet { weights } => {
             let net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
             fits(&net, weights)?;
-            Part::Ffdnet(net)
+            Part::Ffdnet(AdaptiveDenoiser::new(net, adapt)?)
         }
         DenoiserChoice::Fastdvdnet { weights, ends } => {
             let net = nets::Fastdvdnet::load(weights, *ends).context("denoiser.weights")?;
             fits(&net, weights)?;
-            Part::Fastdvdnet(net)
+            Part::Fastdvdnet(AdaptiveDenoiser::new(net, adapt)?)
         }
     })
 }

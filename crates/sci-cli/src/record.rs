@@ -5,6 +5,7 @@
 
 use std::path::Path;
 
+use online::{Counts, Relation, Update};
 use serde::{Deserialize, Serialize};
 
 use crate::io::{FileError, ReadError, read_file};
@@ -66,14 +67,32 @@ pub struct MeasurementRecord {
     pub stop: Stop,
     /// ‖y − H x‖ / ‖y‖ of the result.
     pub relative_residual: Option<f64>,
-    /// Online updates of the denoiser.
+    /// Online updates of the denoiser that were kept.
     pub updates: usize,
     /// Calls of the denoiser.
     pub denoiser_calls: usize,
     /// Work that was left out.
     pub skipped: Skipped,
+    /// How the denoiser adapted; only where it was to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub online: Option<Adaptation>,
     /// What happened, iteration by iteration.
     pub trace: Trace,
+}
+
+/// How the denoiser adapted to a measurement.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Adaptation {
+    /// How well the result before explains this measurement; nothing for the first, and without carry-over.
+    pub relation: Option<Relation>,
+    /// Whether it was solved from the result before.
+    pub warm_start: bool,
+    /// Whether the scene was cut before it.
+    pub cut: bool,
+    /// How many updates of which kind.
+    pub counts: Counts,
+    /// Every update that was due, in order.
+    pub updates: Vec<Update>,
 }
 
 /// Why a solve ended; the same reasons as [`admm::StopReason`].

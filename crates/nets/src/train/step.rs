@@ -2,7 +2,7 @@
 
 use super::adam::Adam;
 use super::checkpoint::{self, Meta};
-use super::config::{Loss, NetworkConfig, TrainConfig};
+use super::config::{Loss, NetworkConfig, Optimizer, TrainConfig};
 use super::data::{TrainData, to_video};
 use super::noise::{add_noise, sensor};
 use crate::weights::{Storage, write_safetensors};
@@ -155,6 +155,7 @@ impl Trainer {
         let mut model = Model::random(&config.network, config.seed)?;
         let vars = model.network_mut().make_trainable()?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
+        let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         Ok(Self { config, data, model, vars, adam, average, step: 0 })
     }

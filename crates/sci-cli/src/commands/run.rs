@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use admm::{BoxError, IterInfo, Observer, Plan, Problem, StopReason};
+use admm::{BoxError, IterInfo, Observer, Plan, StopReason};
 use anyhow::Context;
 use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Axis};
 use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
@@ -54,7 +54,7 @@ impl Args {
             eprintln!("stopped before the first iteration: nothing to write");
             return Ok(Done::Interrupted);
         }
-        finish(&experiment, &scene, &results, &out)
+        finish(&experiment, &scene, &factory, &results, &out)
     }
 }
 
@@ -146,10 +146,9 @@ fn solve_all(
             break;
         }
         let truth = scene.truth_of(k);
-        let problem = Problem::new(&scene.operator, scene.measurement(k))?;
         let mut watch = Watch::new(truth, Progress::new(k, planned));
         let previous = solutions.last().map(|s| s.estimate.view());
-        let solved = factory.solve(&problem, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
+        let solved = factory.solve(scene, k, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
         let trace = watch.finish();
         let mut solution = solution(k, solved, truth, trace, planned);
         solution.record.psnr_rgb_db = solution.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
@@ -162,17 +161,13 @@ fn solve_all(
     Ok(solutions)
 }
 
-fn solution(
-    index: usize,
-    solved: Solved,
-    truth: Option<ArrayView3<'_, f32>>,
-    trace: Trace,
-    planned: usize,
-) -> Solution {
-    let Solved { outcome, denoiser_calls } = solved;
+fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, trace: Trace, whole: usize) -> Solution {
+    let Solved { outcome, planned, denoiser_calls, adaptation } = solved;
     let x = outcome.estimate.view();
-    // Stopping early because nothing changes any more saves iterations; being stopped does not.
-    let saved = if outcome.stop == StopReason::Converged { planned - outcome.iterations } else { 0 };
+    // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
+    // does not.
+    let left = if outcome.stop == StopReason::Converged { planned - outcome.iterations } else { 0 };
+    let counts = adaptation.as_ref().map(|a| a.counts).unwrap_or_default();
     let record = MeasurementRecord {
         index,
         psnr_db: truth.map(|t| mean_over_frames(t, x, psnr)),
@@ -183,9 +178,10 @@ fn solution(
         iterations: outcome.iterations,
         stop: outcome.stop.into(),
         relative_residual: Some(outcome.relative_residual),
-        updates: 0,
+        updates: counts.kept,
         denoiser_calls,
-        skipped: Skipped { iterations: saved, ..Skipped::default() },
+        skipped: Skipped { iterations: whole - planned + left, updates: counts.skipped, ..Skipped::default() },
+        online: adaptation,
         trace,
     };
     Solution { record, estimate: outcome.estimate, rgb: outcome.rgb }
@@ -217,7 +213,12 @@ fn line(m: &MeasurementRecord) -> String {
         Stop::TimeUp => "   time up",
         Stop::Observer => "   stopped",
     };
-    format!("measurement {:>2}   {quality}   {} iterations   {:.2} s{note}", m.index, m.iterations, m.seconds)
+    let updates = m.online.as_ref().map_or(String::new(), |a| {
+        let warm = if a.warm_start { ", from the result before" } else { "" };
+        let cut = if a.cut { ", after a cut" } else { "" };
+        format!("   {} of {} updates kept{warm}{cut}", a.counts.kept, a.counts.fired + a.counts.skipped)
+    });
+    format!("measurement {:>2}   {quality}   {} iterations   {:.2} s{updates}{note}", m.index, m.iterations, m.seconds)
 }
 
 fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
@@ -271,12 +272,18 @@ impl Observer for Watch<'_> {
 }
 
 /// Writes the run and says how it went.
-fn finish(experiment: &Experiment, scene: &Scene, solutions: &[Solution], out: &Path) -> anyhow::Result<Done> {
+fn finish(
+    experiment: &Experiment,
+    scene: &Scene,
+    factory: &Factory<'_>,
+    solutions: &[Solution],
+    out: &Path,
+) -> anyhow::Result<Done> {
     let record = record(experiment, solutions);
     if let (Some(p), Some(s), true) = (record.mean.psnr_db, record.mean.ssim, solutions.len() > 1) {
         outln!("mean             PSNR {p:6.2} dB   SSIM {s:.4}   {:.2} s", record.mean.seconds);
     }
-    write(experiment, scene, solutions, &record, out)?;
+    write(experiment, scene, factory, solutions, &record, out)?;
     outln!("wrote {}; look at {}", out.display(), out.join("report.html").display());
     let diverged = record.measurements.iter().filter(|m| m.stop == crate::record::Stop::Diverged).count();
     anyhow::ensure!(
@@ -311,6 +318,7 @@ fn record(experiment: &Experiment, solutions: &[Solution]) -> Record {
 fn write(
     experiment: &Experiment,
     scene: &Scene,
+    factory: &Factory<'_>,
     solutions: &[Solution],
     record: &Record,
     out: &Path,
@@ -334,6 +342,9 @@ fn write(
     }
     if output.preview {
         write_preview(&dir.join("preview.gif"), video.view(), output.fps)?;
+    }
+    if experiment.online.is_some_and(|o| o.save) {
+        factory.save_adapted(dir)?;
     }
     let images: Vec<MeasurementImages<'_>> = solutions
         .iter()

@@ -7,6 +7,7 @@ use nets::Ends;
 use sci_forward::CfaPattern;
 use toml::Value as Toml;
 
+use super::adaptation::Online;
 use super::file::*;
 use super::source::{ConfigError, Source};
 use crate::io::scene::{Axes, Keys, Reading};
@@ -229,6 +230,8 @@ pub struct Checked {
     pub relative_change: f64,
     /// Stop a measurement after so many seconds.
     pub seconds: Option<f64>,
+    /// `[online]`, if it is enabled.
+    pub online: Option<Online>,
     /// `[output]`.
     pub output: Output,
 }
@@ -249,7 +252,7 @@ const TOP: [&str; 12] = [
 ];
 const PATTERNS: [(&str, CfaPattern); 4] =
     [("rggb", CfaPattern::Rggb), ("bggr", CfaPattern::Bggr), ("grbg", CfaPattern::Grbg), ("gbrg", CfaPattern::Gbrg)];
-const MAX_ITERATIONS: i64 = 100_000;
+pub(super) const MAX_ITERATIONS: i64 = 100_000;
 const SEEDS: RangeInclusive<i64> = 0..=i64::MAX;
 
 /// Checks an experiment.
@@ -260,8 +263,8 @@ pub fn check(source: &Source) -> Result<Checked, ConfigError> {
     Checker { source }.experiment()
 }
 
-struct Checker<'s> {
-    source: &'s Source,
+pub(super) struct Checker<'s> {
+    pub(super) source: &'s Source,
 }
 
 impl<'s> Checker<'s> {
@@ -274,7 +277,7 @@ impl<'s> Checker<'s> {
         let stages = root.take_list("stage")?;
         let named = root.take("schedules")?;
         let stop = root.take("stop")?;
-        let switches = [("skip", root.take("skip")?), ("online", root.take("online")?)];
+        let (skip, online) = (root.take("skip")?, root.take("online")?);
         let output = root.take("output")?;
         let top: TopKeys = root.read(&[])?;
         let seed = self.whole("seed", &top.seed, SEEDS)?.unwrap_or(0) as u64;
@@ -282,13 +285,25 @@ impl<'s> Checker<'s> {
         let data = self.data(data.ok_or_else(|| missing("data"))?, seed)?;
         let (solver, start, demosaicer) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
         let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named)?;
-        for (key, section) in switches {
-            self.switched_off(key, section)?;
-        }
+        self.switched_off("skip", skip)?;
+        let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
         let name = self.name(top.name)?;
         let output = self.output(output)?;
-        Ok(Checked { name, seed, data, solver, start, demosaicer, denoisers, stages, relative_change, seconds, output })
+        Ok(Checked {
+            name,
+            seed,
+            data,
+            solver,
+            start,
+            demosaicer,
+            denoisers,
+            stages,
+            relative_change,
+            seconds,
+            online,
+            output,
+        })
     }
 
     fn name(&self, name: Value) -> Result<Option<String>, ConfigError> {
@@ -649,7 +664,12 @@ impl<'s> Checker<'s> {
         read(v.get_ref()).map(Some).ok_or_else(|| self.value_error(key, &v.span(), legal))
     }
 
-    fn whole(&self, key: &str, value: &Value, range: RangeInclusive<i64>) -> Result<Option<i64>, ConfigError> {
+    pub(super) fn whole(
+        &self,
+        key: &str,
+        value: &Value,
+        range: RangeInclusive<i64>,
+    ) -> Result<Option<i64>, ConfigError> {
         let legal = match *range.end() {
             i64::MAX => format!("a whole number of at least {}", range.start()),
             end => format!("a whole number from {} to {end}", range.start()),
@@ -657,14 +677,20 @@ impl<'s> Checker<'s> {
         self.legal(key, value, &legal, |v| v.as_integer().filter(|i| range.contains(i)))
     }
 
-    fn number(&self, key: &str, value: &Value, range: RangeInclusive<f64>) -> Result<Option<f64>, ConfigError> {
-        let unit = if key.ends_with("sigma") { ", in units of an 8-bit picture" } else { "" };
+    pub(super) fn number(
+        &self,
+        key: &str,
+        value: &Value,
+        range: RangeInclusive<f64>,
+    ) -> Result<Option<f64>, ConfigError> {
+        let unit =
+            if key.ends_with("sigma") || key.ends_with("input_noise") { ", in units of an 8-bit picture" } else { "" };
         let legal = format!("a number from {} to {}{unit}", range.start(), range.end());
         let as_number = |v: &Toml| v.as_float().or_else(|| v.as_integer().map(|i| i as f64));
         self.legal(key, value, &legal, |v| as_number(v).filter(|x| range.contains(x)))
     }
 
-    fn flag(&self, key: &str, value: &Value) -> Result<Option<bool>, ConfigError> {
+    pub(super) fn flag(&self, key: &str, value: &Value) -> Result<Option<bool>, ConfigError> {
         self.legal(key, value, "true or false", Toml::as_bool)
     }
 
@@ -678,7 +704,12 @@ impl<'s> Checker<'s> {
         self.legal(key, value, legal, |v| v.as_str().filter(|t| ok(t)).map(str::to_owned))
     }
 
-    fn choice<T: Copy>(&self, key: &str, value: &Value, legal: &[(&str, T)]) -> Result<Option<T>, ConfigError> {
+    pub(super) fn choice<T: Copy>(
+        &self,
+        key: &str,
+        value: &Value,
+        legal: &[(&str, T)],
+    ) -> Result<Option<T>, ConfigError> {
         let names: Vec<&str> = legal.iter().map(|(name, _)| *name).collect();
         self.legal(key, value, &names.join(", "), |v| {
             legal.iter().find(|(name, _)| v.as_str() == Some(name)).map(|&(_, choice)| choice)

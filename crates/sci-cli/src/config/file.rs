@@ -163,7 +163,35 @@ pub struct StopKeys {
     pub seconds: Value,
 }
 
-/// `[skip]` and `[online]`.
+/// `[online]`.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct OnlineKeys {
+    pub enabled: Value,
+    pub preset: Value,
+    pub reuse: Value,
+    pub effort: Value,
+    pub first: Value,
+    pub interval: Value,
+    pub max_updates: Value,
+    pub steps: Value,
+    pub learning_rate: Value,
+    pub input_noise: Value,
+    pub growth: Value,
+    pub keep_optimizer: Value,
+    pub parameters: Value,
+    pub pseudo_clean: Value,
+    pub distance: Value,
+    pub equivariance: Value,
+    pub held_out: Value,
+    pub back_off: Value,
+    pub patience: Value,
+    pub blind: Value,
+    pub save: Value,
+}
+
+/// `[skip]`.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]

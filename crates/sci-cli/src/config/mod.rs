@@ -4,6 +4,7 @@
 //! Only the last type reaches the rest of the program, so no other code has to doubt a value. An error names the file
 //! and line (or the `--set` argument), the key, the value and what is legal.
 
+pub mod adaptation;
 pub mod check;
 pub mod file;
 pub mod resolve;

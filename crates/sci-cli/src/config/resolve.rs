@@ -11,6 +11,7 @@ use super::check::{self, Checked, Mask, Momentum, PathSetting};
 use super::source::{ConfigError, Place, Source};
 use crate::io::scene::{Axes, Reading};
 
+pub use super::adaptation::Online;
 pub use super::check::{Demosaicer, Output, OutputFormat, RandomMask, Solver, Start};
 
 /// The environment variable that names a folder of scenes and weights.
@@ -124,6 +125,8 @@ pub struct Experiment {
     pub relative_change: f64,
     /// Stop a measurement after so many seconds.
     pub seconds: Option<f64>,
+    /// How networks adapt while they solve, if they do.
+    pub online: Option<Online>,
     /// What to write.
     pub output: Output,
 }
@@ -200,6 +203,7 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         stages,
         relative_change: checked.relative_change,
         seconds: checked.seconds,
+        online: checked.online,
         output: checked.output,
     })
 }
@@ -321,7 +325,7 @@ impl Experiment {
                 .collect::<Vec<_>>(),
             "stop": { "relative_change": self.relative_change, "seconds": self.seconds },
             "skip": { "enabled": false },
-            "online": { "enabled": false },
+            "online": self.online.as_ref().map_or_else(|| json!({ "enabled": false }), online_json),
             "output": {
                 "format": match self.output.format { OutputFormat::Npy => "npy", OutputFormat::Npz => "npz", OutputFormat::Mat => "mat" },
                 "frames": self.output.frames, "preview": self.output.preview, "fps": self.output.fps,
@@ -392,6 +396,32 @@ impl Experiment {
         };
         value
     }
+}
+
+fn online_json(o: &Online) -> Value {
+    let (schedule, terms, guard) = (o.adapt.schedule, o.adapt.terms, o.adapt.guard);
+    json!({
+        "enabled": true,
+        "reuse": o.sequence.reuse,
+        "effort": o.sequence.effort,
+        "first": schedule.first,
+        "interval": schedule.interval,
+        "max_updates": schedule.max_updates,
+        "steps": schedule.steps,
+        "learning_rate": schedule.learning_rate,
+        "input_noise": schedule.input_noise,
+        "growth": schedule.growth,
+        "keep_optimizer": schedule.keep_optimizer,
+        "parameters": o.adapt.parameters,
+        "pseudo_clean": terms.pseudo_clean,
+        "distance": terms.distance,
+        "equivariance": terms.equivariance,
+        "held_out": guard.held_out,
+        "back_off": guard.back_off,
+        "patience": guard.patience,
+        "blind": o.adapt.blind,
+        "save": o.save,
+    })
 }
 
 fn denoiser_json(d: &Denoiser) -> Value {

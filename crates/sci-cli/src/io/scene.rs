@@ -5,6 +5,7 @@
 //! truth it is compared with, is the mosaic; RGB truth is kept beside it.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use ndarray::{Array3, Array4, ArrayD, ArrayView2, ArrayView3, ArrayView4, Axis, Ix3, Ix4, IxDyn, s};
 use sci_forward::bayer::mosaic_into;
@@ -174,7 +175,7 @@ fn list(names: &[String]) -> String {
 #[derive(Clone, Debug)]
 pub struct Scene {
     /// C `[B, H, W]` as an operator.
-    pub operator: MaskOperator,
+    pub operator: Arc<MaskOperator>,
     /// y `[N, H, W]`, up to `Σ_t C_t`.
     pub measurements: Array3<f32>,
     /// x `[T, H, W]` in `[0, 1]`, the mosaic for color; frame `k·B + t` belongs to measurement k.
@@ -241,7 +242,7 @@ impl Scene {
                 (Some(x), Some(rgb))
             }
         };
-        let operator = MaskOperator::new(masks);
+        let operator = Arc::new(MaskOperator::new(masks));
         let mut warnings = Vec::new();
         let measurements = match (measurements, &truth) {
             (Some(m), _) => m,

@@ -1,0 +1,112 @@
+//! Owns the rules of `[online]`.
+
+use nets::Parameters;
+use online::{AdaptConfig, Guard, Reuse, Schedule, SequenceConfig, Terms};
+
+use super::check::{Checker, Denoiser, MAX_ITERATIONS};
+use super::file::{OnlineKeys, Section, Value};
+use super::source::ConfigError;
+
+/// `[online]`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Online {
+    /// How networks adapt.
+    pub adapt: AdaptConfig,
+    /// What the next measurement takes over.
+    pub sequence: SequenceConfig,
+    /// Whether the adapted weights are written.
+    pub save: bool,
+}
+
+const PARAMETERS: [(&str, Parameters); 5] = [
+    ("all", Parameters::All),
+    ("biases", Parameters::Biases),
+    ("first-last", Parameters::FirstLast),
+    ("last", Parameters::Last),
+    ("norm-affine", Parameters::NormAffine),
+];
+impl<'s> Checker<'s> {
+    /// The settings of `[online]`, if the table is there and not switched off.
+    pub(super) fn online(
+        &self,
+        section: Option<Section<'s>>,
+        seed: u64,
+        denoisers: &[Denoiser],
+    ) -> Result<Option<Online>, ConfigError> {
+        let Some(section) = section else { return Ok(None) };
+        let table = section.span.clone();
+        let k: OnlineKeys = section.read(&[])?;
+        let enabled = self.flag("online.enabled", &k.enabled)?.unwrap_or(true);
+        let presets = [
+            ("default", AdaptConfig::default()),
+            ("paper-ffdnet", AdaptConfig::PAPER_FFDNET),
+            ("paper-fastdvdnet", AdaptConfig::PAPER_FASTDVDNET),
+        ];
+        let preset = self.choice("online.preset", &k.preset, &presets)?.unwrap_or_default();
+        let adapt = AdaptConfig {
+            schedule: self.updates(&k, preset.schedule)?,
+            parameters: self.choice("online.parameters", &k.parameters, &PARAMETERS)?.unwrap_or(preset.parameters),
+            terms: self.terms(&k, preset.terms)?,
+            guard: self.guard(&k, preset.guard)?,
+            blind: self.number("online.blind", &k.blind, 0.01..=0.9)?.or(preset.blind),
+            seed,
+        };
+        let default = SequenceConfig::default();
+        let reuse = [("reset", Reuse::Reset), ("carry-over", Reuse::CarryOver)];
+        let sequence = SequenceConfig {
+            reuse: self.choice("online.reuse", &k.reuse, &reuse)?.unwrap_or(default.reuse),
+            effort: self.number("online.effort", &k.effort, 1e-3..=1.0)?.unwrap_or(default.effort),
+            ..default
+        };
+        let save = self.flag("online.save", &k.save)?.unwrap_or(false);
+        if !enabled {
+            return Ok(None);
+        }
+        // What no single key can show, such as held_out and blind together.
+        adapt.validate().map_err(|e| self.source.error(&table, format!("`online`: {e}")))?;
+        if denoisers.iter().all(|d| matches!(d, Denoiser::Tv { .. })) {
+            return Err(self.source.error(&table, "[online] has no effect: no stage has a network to adapt"));
+        }
+        Ok(Some(Online { adapt, sequence, save }))
+    }
+
+    fn updates(&self, k: &OnlineKeys, preset: Schedule) -> Result<Schedule, ConfigError> {
+        let whole = |key: &str, value: &Value, range| self.whole(&format!("online.{key}"), value, range);
+        let max_updates = whole("max_updates", &k.max_updates, 0..=MAX_ITERATIONS)?;
+        Ok(Schedule {
+            first: whole("first", &k.first, 0..=MAX_ITERATIONS)?.map_or(preset.first, |n| n as usize),
+            interval: whole("interval", &k.interval, 1..=MAX_ITERATIONS)?.map_or(preset.interval, |n| n as usize),
+            max_updates: max_updates.map_or(preset.max_updates, |n| Some(n as usize)),
+            steps: whole("steps", &k.steps, 1..=1000)?.map_or(preset.steps, |n| n as usize),
+            learning_rate: self
+                .number("online.learning_rate", &k.learning_rate, 1e-12..=1.0)?
+                .unwrap_or(preset.learning_rate),
+            input_noise: self
+                .number("online.input_noise", &k.input_noise, 0.0..=255.0)?
+                .map_or(preset.input_noise, |n| n as f32 / 255.0),
+            growth: self.number("online.growth", &k.growth, 1.0..=1e6)?.unwrap_or(preset.growth),
+            keep_optimizer: self.flag("online.keep_optimizer", &k.keep_optimizer)?.unwrap_or(preset.keep_optimizer),
+        })
+    }
+
+    fn terms(&self, k: &OnlineKeys, preset: Terms) -> Result<Terms, ConfigError> {
+        let weight = |key: &str, value: &Value, preset: f64| {
+            Ok(self.number(&format!("online.{key}"), value, 0.0..=1e6)?.unwrap_or(preset))
+        };
+        Ok(Terms {
+            pseudo_clean: weight("pseudo_clean", &k.pseudo_clean, preset.pseudo_clean)?,
+            distance: weight("distance", &k.distance, preset.distance)?,
+            equivariance: weight("equivariance", &k.equivariance, preset.equivariance)?,
+        })
+    }
+
+    fn guard(&self, k: &OnlineKeys, preset: Guard) -> Result<Guard, ConfigError> {
+        Ok(Guard {
+            held_out: self.number("online.held_out", &k.held_out, 0.0..=0.9)?.unwrap_or(preset.held_out),
+            back_off: self.number("online.back_off", &k.back_off, 1e-3..=1.0)?.unwrap_or(preset.back_off),
+            patience: self
+                .whole("online.patience", &k.patience, 0..=MAX_ITERATIONS)?
+                .map_or(preset.patience, |n| n as usize),
+        })
+    }
+}

@@ -1,0 +1,105 @@
+//! `[online]`: a network that adapts, from the experiment file to the record.
+
+use e2e::Bench;
+use serde_json::Value;
+
+const EXPERIMENT: &str = r#"
+[data]
+kind = "simulate"
+path = "video.npy"
+[data.mask]
+kind = "random"
+frames = 4
+[solver]
+kind = "gap"
+[denoiser]
+kind = "ffdnet"
+weights = "net.safetensors"
+[[stage]]
+sigma = 25
+iterations = 3
+[[stage]]
+sigma = 12
+iterations = 4
+[online]
+interval = 2
+learning_rate = 1e-3
+held_out = 0
+growth = 1
+save = true
+"#;
+
+/// Three measurements of a moving pattern, and a network small enough to train in a test.
+fn bench() -> Bench {
+    let bench = Bench::new();
+    let video = ndarray::Array3::from_shape_fn((12, 32, 32), |(t, y, x)| {
+        0.5 + 0.3 * (0.4 * x as f32 + 0.05 * t as f32).sin() * (0.3 * y as f32).cos()
+    });
+    let mut bytes = Vec::new();
+    ndarray_npy::WriteNpyExt::write_npy(&video, &mut bytes).unwrap();
+    bench.write("video.npy", bytes);
+    bench.write("a.toml", EXPERIMENT);
+    let layout = nets::FfdnetLayout::Residual { batch_norm: false };
+    let spec = nets::FfdnetSpec { width: 8, depth: 3, layout, ..nets::FfdnetSpec::GRAY };
+    let net = nets::Ffdnet::random(spec, 0).unwrap();
+    let mut tensors = nets::Network::state(&net);
+    // Near the identity, as a residual network with small weights is.
+    tensors.values_mut().for_each(|t| *t = t.affine(0.3, 0.0).unwrap());
+    nets::weights::write_safetensors(&bench.path("net.safetensors"), &tensors, nets::weights::Storage::F32).unwrap();
+    bench
+}
+
+fn run(bench: &Bench, out: &str, set: &[&str]) -> Value {
+    let mut args = vec!["run", "a.toml", "--out", out];
+    args.extend(set.iter().flat_map(|s| ["--set", s]));
+    let run = bench.sci(&args);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    bench.record(out)
+}
+
+fn psnr(record: &Value) -> Vec<f64> {
+    record["measurements"].as_array().unwrap().iter().map(|m| m["psnr_db"].as_f64().unwrap()).collect()
+}
+
+#[test]
+fn updates_are_recorded_and_the_switch_turns_all_of_it_off() {
+    let bench = bench();
+    let plain = run(&bench, "plain", &["online.enabled=false"]);
+    assert!(plain["measurements"][0].get("online").is_none());
+    assert_eq!(plain["config"]["online"]["enabled"], false);
+    assert!(!bench.path("plain/adapted-0-ffdnet.safetensors").exists());
+
+    let adapted = run(&bench, "adapted", &[]);
+    for m in adapted["measurements"].as_array().unwrap() {
+        let (online, updates) = (&m["online"], m["online"]["updates"].as_array().unwrap());
+        let iterations: Vec<_> = updates.iter().map(|u| u["iteration"].as_u64().unwrap()).collect();
+        assert_eq!(iterations, [2, 4], "the default ends after two");
+        assert_eq!(online["counts"]["kept"], m["updates"]);
+        assert_eq!(online["counts"]["fired"], 2);
+    }
+    assert_ne!(psnr(&adapted), psnr(&plain));
+
+    // Far too large a step: all are undone, so that the result is the plain one.
+    let guarded = run(&bench, "guarded", &["online.held_out=0.1", "online.learning_rate=1.0"]);
+    assert_eq!(psnr(&guarded), psnr(&plain));
+    for m in guarded["measurements"].as_array().unwrap() {
+        assert_eq!((m["updates"].as_u64(), m["online"]["counts"]["rolled_back"].as_u64()), (Some(0), Some(2)));
+    }
+}
+
+#[test]
+fn measurements_under_reset_are_single_runs_and_saved_weights_can_be_named() {
+    let bench = bench();
+    let all = psnr(&run(&bench, "all", &[]));
+    for (k, expected) in all.iter().enumerate() {
+        let alone = run(&bench, "alone", &[&format!("data.measurements=[{k}]")]);
+        assert_eq!(psnr(&alone), [*expected], "measurement {k}");
+    }
+    let carried = psnr(&run(&bench, "carried", &["online.reuse=carry-over"]));
+    assert_eq!(carried[0], all[0]);
+    assert_ne!(carried[1..], all[1..]);
+
+    let weights = "denoiser.weights=all/adapted-0-ffdnet.safetensors";
+    let named = run(&bench, "named", &[weights, "online.enabled=false"]);
+    assert_ne!(psnr(&named), psnr(&run(&bench, "plain", &["online.enabled=false"])));
+}
