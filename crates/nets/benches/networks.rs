@@ -40,7 +40,9 @@ fn training(c: &mut Criterion) {
             frames: 1,
             batch: 16,
         },
-        noise: NoiseConfig { sigma: [0.0, 75.0] },
+        weights: None,
+        noise: Some(NoiseConfig { sigma: [0.0, 75.0] }),
+        iterates: None,
         training: TrainingConfig {
             steps: u64::MAX,
             optimizer: Optimizer::Muon,

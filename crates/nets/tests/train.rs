@@ -33,7 +33,9 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
             frames,
             batch: 2,
         },
-        noise: NoiseConfig { sigma: [0.0, 50.0] },
+        weights: None,
+        noise: Some(NoiseConfig { sigma: [0.0, 50.0] }),
+        iterates: None,
         training: TrainingConfig {
             steps,
             optimizer: Optimizer::Muon,
@@ -88,6 +90,72 @@ fn resuming_is_the_straight_run_bit_for_bit() {
     }
 }
 
+/// The same run on the iterates of a solver, one clip a step.
+fn on_iterates(mut config: TrainConfig) -> TrainConfig {
+    config.noise = None;
+    config.data.frames = 1;
+    config.data.batch = 1;
+    config.iterates =
+        Some(IteratesConfig { sigmas: vec![50.0, 25.0, 12.0], frames: [2, 4], density: [0.3, 0.7], gray_masks: 0.5 });
+    config
+}
+
+#[test]
+fn training_on_iterates_learns_resumes_and_validates_by_reconstruction() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    for network in [FFDNET, FASTDVDNET, NetworkConfig::Ffdnet { channels: 3, width: 8, depth: 3 }] {
+        let config = on_iterates(config(network, 1, 24));
+        let mut straight = trainer(&config);
+        let before = straight.validate().unwrap();
+        assert_eq!(before.len(), 1);
+        assert_eq!(before[0].sigma, None);
+        run(&mut straight, 12);
+        straight.save(&path).unwrap();
+        let rest = run(&mut straight, 12);
+        let mut second = trainer(&config);
+        second.resume(&path).unwrap();
+        assert_eq!(run(&mut second, 12), rest);
+        assert_eq!(bits(&second), bits(&straight));
+        let after = straight.validate().unwrap();
+        assert!(after[0].psnr_db > before[0].psnr_db + 1.0, "{before:?} {after:?}");
+    }
+}
+
+#[test]
+fn a_run_can_begin_with_weights() {
+    let config = config(FFDNET, 1, 4);
+    let mut first = trainer(&config);
+    run(&mut first, 4);
+    let weights = first.weights().unwrap();
+    let mut second = trainer(&on_iterates(config));
+    second.start_from(&weights).unwrap();
+    assert_eq!(bits(&second), bits(&first));
+    let other = trainer(&self::config(FASTDVDNET, 1, 1)).weights().unwrap();
+    assert!(matches!(second.start_from(&other), Err(Error::State { .. })));
+}
+
+#[test]
+fn noise_or_iterates_but_not_both() {
+    let good = on_iterates(config(FFDNET, 1, 1));
+    let key = |change: fn(&mut TrainConfig)| {
+        let mut config = good.clone();
+        change(&mut config);
+        match config.validate() {
+            Err(Error::Setting { key, .. }) => key,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(good.validate().is_ok());
+    assert_eq!(key(|c| c.noise = Some(NoiseConfig { sigma: [0.0, 50.0] })), "noise");
+    assert_eq!(key(|c| c.iterates = None), "noise");
+    assert_eq!(key(|c| c.network = DDNET), "iterates");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().sigmas.clear()), "iterates.sigmas");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().frames = [1, 4]), "iterates.frames");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().density = [0.5, 0.3]), "iterates.density");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().gray_masks = f64::NAN), "iterates.gray_masks");
+}
+
 #[test]
 fn the_number_of_threads_changes_no_bit() {
     let config = config(FFDNET, 1, 3);
@@ -136,7 +204,12 @@ fn a_checkpoint_of_other_settings_is_refused() {
     let path = folder.path().join("run.safetensors");
     let config = config(FFDNET, 1, 9);
     trainer(&config).save(&path).unwrap();
-    let other = TrainConfig { noise: NoiseConfig { sigma: [5.0, 10.0] }, ..config.clone() };
+    let other = TrainConfig {
+        weights: None,
+        noise: Some(NoiseConfig { sigma: [5.0, 10.0] }),
+        iterates: None,
+        ..config.clone()
+    };
     let error = trainer(&other).resume(&path).unwrap_err().to_string();
     assert!(error.contains("noise") && error.contains("50.0"), "{error}");
     let mut moved = config;
@@ -148,7 +221,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
 fn overfit(network: NetworkConfig, frames: usize, steps: usize) {
     let mut config = config(network, frames, steps as u64);
     config.data.photo_share = 0.0;
-    config.noise.sigma = [0.0, 0.0];
+    config.noise = Some(NoiseConfig { sigma: [0.0, 0.0] });
     config.training.learning_rate = 1e-2;
     let wave = |c: usize, y: usize, x: usize| (0.4 * y as f32 + c as f32).sin() + (0.3 * x as f32).cos();
     let shape = (config.network.channels(), 16, 16);
@@ -208,7 +281,7 @@ fn every_setting_has_its_range() {
         ("data.patch", |c| c.data.patch = 30),
         ("data.frames", |c| c.data.frames = 0),
         ("data.batch", |c| c.data.batch = 0),
-        ("noise.sigma", |c| c.noise.sigma = [30.0, 300.0]),
+        ("noise.sigma", |c| c.noise = Some(NoiseConfig { sigma: [30.0, 300.0] })),
         ("training.steps", |c| c.training.steps = 0),
         ("training.learning_rate", |c| c.training.learning_rate = -1.0),
         ("training.warmup", |c| c.training.warmup = 100),

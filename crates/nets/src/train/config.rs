@@ -18,8 +18,15 @@ pub struct TrainConfig {
     pub network: NetworkConfig,
     /// What it is trained on.
     pub data: DataConfig,
-    /// The noise put on its input.
-    pub noise: NoiseConfig,
+    /// Weights to begin with, a file or `bundled:NAME`; random ones without.
+    #[serde(default)]
+    pub weights: Option<PathBuf>,
+    /// The noise put on its input; this or `iterates`.
+    #[serde(default)]
+    pub noise: Option<NoiseConfig>,
+    /// The solver whose iterates are its input; this or `noise`.
+    #[serde(default)]
+    pub iterates: Option<IteratesConfig>,
     /// How it is trained.
     pub training: TrainingConfig,
     /// How it is watched.
@@ -144,6 +151,22 @@ pub struct TrainingConfig {
     pub clip_norm: f64,
 }
 
+/// Training on the iterates of accelerated GAP: each clip is measured through new random masks, and solved; every call of the
+/// denoiser is an update towards the truth.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IteratesConfig {
+    /// σ of each iteration in 0..255 units, at least one.
+    pub sigmas: Vec<f32>,
+    /// Frames of a measurement, the fewest and the most, drawn for each clip; 2 to 64.
+    pub frames: [usize; 2],
+    /// Share of open pixels of binary masks, the least and the most; in (0, 1].
+    pub density: [f64; 2],
+    /// Share of the clips whose masks have any transmittance. Default 0.
+    #[serde(default)]
+    pub gray_masks: f64,
+}
+
 /// How weights follow gradients; both take the same learning rates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -227,8 +250,14 @@ impl TrainConfig {
         check(patch, "data.patch", data.patch, "a multiple of 4 from 4 to 1024")?;
         check((1..=64).contains(&data.frames), "data.frames", data.frames, "1 to 64")?;
         check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
-        let [low, high] = self.noise.sigma;
-        check(level(low) && level(high) && low <= high, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
+        match (&self.noise, &self.iterates) {
+            (Some(NoiseConfig { sigma: [low, high] }), None) => {
+                let ordered = level(*low) && level(*high) && low <= high;
+                check(ordered, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
+            }
+            (None, Some(iterates)) => self.validate_iterates(iterates)?,
+            _ => check(false, "noise", "noise and iterates", "one of the two tables, [noise] or [iterates]")?,
+        }
         check(training.steps >= 1, "training.steps", training.steps, "at least 1")?;
         let rate = training.learning_rate;
         check(rate > 0.0 && rate <= 1.0, "training.learning_rate", rate, "above 0 and at most 1")?;
@@ -246,6 +275,24 @@ impl TrainConfig {
         check(self.checkpoint.every >= 1, "checkpoint.every", self.checkpoint.every, "at least 1")
     }
 
+    fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
+        let IteratesConfig { sigmas, frames: [few, many], density: [thin, dense], gray_masks } = iterates;
+        check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
+        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: iterates.frames says how many")?;
+        check(
+            !sigmas.is_empty() && sigmas.iter().all(|&s| level(s)),
+            "iterates.sigmas",
+            list(sigmas),
+            "each 0 to 255",
+        )?;
+        let frames = (2..=64).contains(few) && (*few..=64).contains(many);
+        check(frames, "iterates.frames", format_args!("[{few}, {many}]"), "two numbers from 2 to 64, the lower first")?;
+        let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
+        let legal = "two shares above 0 and at most 1, the lower first";
+        check(density, "iterates.density", format_args!("[{thin}, {dense}]"), legal)?;
+        check((0.0..=1.0).contains(gray_masks), "iterates.gray_masks", gray_masks, "0 to 1")
+    }
+
     /// The learning rate of a step, counted from 0: a linear rise, then half a cosine.
     pub fn learning_rate(&self, step: u64) -> f64 {
         let TrainingConfig { steps, learning_rate, final_learning_rate, warmup, .. } = self.training;
@@ -259,6 +306,10 @@ impl TrainConfig {
 }
 
 const LEVELS: &str = "two levels from 0 to 255, the lower one first";
+
+fn list(sigmas: &[f32]) -> String {
+    format!("{sigmas:?}")
+}
 
 fn level(sigma: f32) -> bool {
     (0.0..=255.0).contains(&sigma)

@@ -6,14 +6,15 @@ mod adam;
 mod checkpoint;
 mod config;
 mod data;
+mod iterates;
 mod muon;
 mod noise;
 mod step;
 
 pub use adam::Adam;
 pub use config::{
-    CheckpointConfig, DataConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig,
-    ValidationConfig,
+    CheckpointConfig, DataConfig, IteratesConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig,
+    TrainingConfig, ValidationConfig,
 };
 pub use data::{Frame, TrainData, frame_from_rgb};
 pub use step::{Resumed, Score, StepReport, Trainer};

@@ -2,14 +2,15 @@
 
 use super::adam::Adam;
 use super::checkpoint::{self, Meta};
-use super::config::{Loss, NetworkConfig, Optimizer, TrainConfig};
+use super::config::{IteratesConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig};
 use super::data::{TrainData, to_video};
+use super::iterates::Simulated;
 use super::noise::{add_noise, sensor};
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
 use admm::{DenoiseCx, Denoiser};
 use candle_core::{Device, Tensor, Var};
-use ndarray::{Array4, ArrayView4, Axis, concatenate};
+use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sci_forward::metrics::psnr;
@@ -32,8 +33,8 @@ pub struct StepReport {
 /// Mean PSNR over the frames of all validation clips.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Score {
-    /// σ in 0..255 units.
-    pub sigma: f32,
+    /// σ in 0..255 units; nothing for clips that were reconstructed from a measurement.
+    pub sigma: Option<f32>,
     /// PSNR of the result in dB, data range 1.
     pub psnr_db: f64,
 }
@@ -144,6 +145,55 @@ impl std::fmt::Debug for Trainer {
 /// Streams of the generator: the steps take the ones from 0.
 const VALIDATION_STREAM: u64 = 1 << 63;
 
+/// Frames and largest side of the clips that are reconstructed to validate.
+const VALIDATION_FRAMES: usize = 8;
+const VALIDATION_SIDE: usize = 256;
+
+/// The network as the denoiser of a solver, with an update towards the truth in each call.
+struct Trainee<'t> {
+    trainer: &'t mut Trainer,
+    clean: Tensor,
+    losses: &'t mut Vec<f32>,
+    norms: &'t mut Vec<f64>,
+}
+
+impl Denoiser for Trainee<'_> {
+    fn name(&self) -> &str {
+        "trainee"
+    }
+
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> std::result::Result<(), admm::BoxError> {
+        let seen = stack(&[noisy.as_standard_layout().into_owned()])?;
+        let (output, loss, norm) = self.trainer.update(&self.clean, &seen, &[cx.sigma])?;
+        self.losses.push(loss);
+        self.norms.push(norm);
+        let values = Array4::from_shape_vec(noisy.dim(), output.flatten_all()?.to_vec1()?)?;
+        out.assign(&values);
+        Ok(())
+    }
+}
+
+impl Denoiser for Model {
+    fn name(&self) -> &str {
+        "model"
+    }
+
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> std::result::Result<(), admm::BoxError> {
+        out.assign(&self.restore(noisy, cx.sigma)?);
+        Ok(())
+    }
+}
+
 impl Trainer {
     /// A run at its beginning.
     ///
@@ -158,6 +208,18 @@ impl Trainer {
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         Ok(Self { config, data, model, vars, adam, average, step: 0 })
+    }
+
+    /// Begins with these weights instead of random ones.
+    ///
+    /// # Errors
+    /// [`Error::State`] when names or shapes are not those of the network.
+    pub fn start_from(&mut self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
+        self.model.network_mut().set_state(weights)?;
+        self.vars = self.model.network_mut().make_trainable()?;
+        self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
+        self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        Ok(())
     }
 
     /// The settings.
@@ -193,17 +255,15 @@ impl Trainer {
     }
 
     /// Clean clips, what the network sees of them, σ of each; `[batch · T, C, P, P]`.
-    fn batch(&self) -> Result<(Tensor, Tensor, Vec<f32>)> {
+    fn batch(&self, noise: &NoiseConfig, rng: &mut ChaCha8Rng) -> Result<(Tensor, Tensor, Vec<f32>)> {
         let data = &self.config.data;
-        let [low, high] = self.config.noise.sigma.map(|s| s / 255.0);
-        // Stream 0 initialised the weights.
-        let mut rng = self.rng(self.step + 1);
+        let [low, high] = noise.sigma.map(|s| s / 255.0);
         let (mut clean, mut seen, mut sigmas) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..data.batch {
-            let clip = self.data.clip(&mut rng, data.frames, data.patch, data.photo_share);
+            let clip = self.data.clip(rng, data.frames, data.patch, data.photo_share);
             let sigma = low + (high - low) * rng.random::<f32>();
             let mut noisy = clip.clone();
-            add_noise(&mut noisy, sigma, &mut rng);
+            add_noise(&mut noisy, sigma, rng);
             seen.push(self.model.input(noisy));
             clean.push(clip);
             sigmas.push(sigma);
@@ -211,13 +271,34 @@ impl Trainer {
         Ok((stack(&clean)?, stack(&seen)?, sigmas))
     }
 
-    /// One step of the optimiser on a new batch.
+    /// One step: an update by a new batch of noisy clips, or one by each iterate of each clip of a new batch.
     ///
     /// # Errors
-    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the step.
+    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the update.
+    ///
+    /// # Panics
+    /// Never: [`Trainer::new`] checked the settings.
     pub fn step(&mut self) -> Result<StepReport> {
-        let (clean, seen, sigmas) = self.batch()?;
-        let error = (self.model.network().forward(&seen, &sigmas)? - clean)?;
+        // Stream 0 initialised the weights.
+        let mut rng = self.rng(self.step + 1);
+        let learning_rate = self.config.learning_rate(self.step);
+        let (loss, gradient_norm) = match self.config.iterates.clone() {
+            Some(iterates) => self.reconstruct(&iterates, &mut rng)?,
+            None => {
+                let noise = self.config.noise.clone().expect("validated: noise or iterates");
+                let (clean, seen, sigmas) = self.batch(&noise, &mut rng)?;
+                let (_, loss, norm) = self.update(&clean, &seen, &sigmas)?;
+                (loss, norm)
+            }
+        };
+        self.step += 1;
+        Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm })
+    }
+
+    /// One update; the output before it, the loss, and the norm of the gradient.
+    fn update(&mut self, clean: &Tensor, seen: &Tensor, sigmas: &[f32]) -> Result<(Tensor, f32, f64)> {
+        let out = self.model.network().forward(seen, sigmas)?;
+        let error = (&out - clean)?;
         let loss = match self.config.training.loss {
             Loss::L1 => error.abs()?,
             Loss::L2 => error.sqr()?,
@@ -233,9 +314,25 @@ impl Trainer {
         if !gradient_norm.is_finite() {
             return Err(diverged);
         }
-        self.step += 1;
         self.update_average()?;
-        Ok(StepReport { step: self.step, loss: value, learning_rate, gradient_norm })
+        Ok((out.detach(), value, gradient_norm))
+    }
+
+    /// Solves new measurements, with an update in each call of the denoiser; the means of loss and gradient norm.
+    fn reconstruct(&mut self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<(f32, f64)> {
+        let (mut losses, mut norms) = (Vec::new(), Vec::new());
+        for _ in 0..self.config.data.batch {
+            let data = &self.config.data;
+            let [few, many] = settings.frames;
+            let frames = rng.random_range(few..=many);
+            let clip = self.data.clip(rng, frames, data.patch, data.photo_share);
+            let simulated = Simulated::random(clip.view(), settings, rng)?;
+            let clean = stack(std::slice::from_ref(&clip))?;
+            let mut trainee = Trainee { trainer: self, clean, losses: &mut losses, norms: &mut norms };
+            simulated.solve(&settings.sigmas, &mut trainee)?;
+        }
+        let count = losses.len().max(1);
+        Ok((losses.iter().sum::<f32>() / count as f32, norms.iter().sum::<f64>() / count as f64))
     }
 
     fn update_average(&mut self) -> Result<()> {
@@ -276,14 +373,9 @@ impl Trainer {
     /// # Errors
     /// When a tensor operation fails.
     pub fn validate(&self) -> Result<Vec<Score>> {
-        let mut model = self.model.clone();
-        let mut weights = self.weights()?;
-        for conv in model.network_mut().convs_mut() {
-            for (name, tensor, _) in conv.tensors_mut() {
-                if let Some(average) = weights.remove(&name) {
-                    *tensor = average;
-                }
-            }
+        let mut model = self.averaged()?;
+        if let Some(iterates) = &self.config.iterates {
+            return Ok(vec![self.score_reconstruction(&mut model, iterates)?]);
         }
         let settings = &self.config.validation;
         let mut scores = Vec::new();
@@ -299,9 +391,39 @@ impl Trainer {
                     count += 1;
                 }
             }
-            scores.push(Score { sigma, psnr_db: sum / f64::from(count) });
+            scores.push(Score { sigma: Some(sigma), psnr_db: sum / f64::from(count) });
         }
         Ok(scores)
+    }
+
+    /// PSNR of the middle of each held-out clip, its first frames measured through the same random masks every time.
+    fn score_reconstruction(&self, model: &mut Model, settings: &IteratesConfig) -> Result<Score> {
+        let (mut sum, mut count) = (0.0, 0);
+        for (i, clip) in self.data.validation.iter().enumerate() {
+            let mut rng = self.rng(VALIDATION_STREAM + i as u64);
+            let clean = centre(&to_video(clip, VALIDATION_FRAMES));
+            let simulated = Simulated::random(clean.view(), settings, &mut rng)?;
+            let restored = simulated.solve(&settings.sigmas, model)?;
+            for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
+                sum += frame_psnr(clean, restored);
+                count += 1;
+            }
+        }
+        Ok(Score { sigma: None, psnr_db: sum / f64::from(count) })
+    }
+
+    /// The model with the averaged weights, for inference.
+    fn averaged(&self) -> Result<Model> {
+        let mut model = self.model.clone();
+        let mut weights = self.weights()?;
+        for conv in model.network_mut().convs_mut() {
+            for (name, tensor, _) in conv.tensors_mut() {
+                if let Some(average) = weights.remove(&name) {
+                    *tensor = average;
+                }
+            }
+        }
+        Ok(model)
     }
 
     /// Writes a checkpoint; the one that was there is kept as `NAME.previous.safetensors`.
@@ -366,6 +488,14 @@ impl Trainer {
 
 fn values(var: &Var) -> Result<Vec<f32>> {
     Ok(var.flatten_all()?.to_vec1()?)
+}
+
+/// The middle of a video `[T, C, H, W]`, at most [`VALIDATION_SIDE`] high and wide.
+fn centre(video: &Array4<f32>) -> Array4<f32> {
+    let (_, _, height, width) = video.dim();
+    let (h, w) = (height.min(VALIDATION_SIDE), width.min(VALIDATION_SIDE));
+    let (y, x) = ((height - h) / 2, (width - w) / 2);
+    video.slice(s![.., .., y..y + h, x..x + w]).to_owned()
 }
 
 /// Clips of equal shape, one after another.

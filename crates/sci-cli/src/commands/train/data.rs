@@ -4,6 +4,7 @@ use std::env;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use nets::WeightFile;
 use nets::train::{Frame, TrainConfig, TrainData, frame_from_rgb};
 use rayon::prelude::*;
 
@@ -29,18 +30,25 @@ pub(super) fn load(config: &TrainConfig, file: &Path) -> anyhow::Result<TrainDat
     Ok(TrainData { videos, photos, validation })
 }
 
+/// The weights a run begins with.
+pub(super) fn weights(path: &Path, file: &Path) -> anyhow::Result<WeightFile> {
+    let bundled = path.to_str().is_some_and(|p| p.starts_with("bundled:"));
+    let path = if bundled { path.to_owned() } else { locate(path, file).context("weights")? };
+    Ok(WeightFile::read(&path)?)
+}
+
 /// A relative path is looked up beside the training file, then in the current folder, then in SCI_DATA.
 fn locate(path: &Path, file: &Path) -> anyhow::Result<PathBuf> {
     let beside = file.parent().map_or(PathBuf::new(), Path::to_owned);
     let mut folders = vec![beside, PathBuf::new()];
     folders.extend(env::var_os(DATA_VARIABLE).filter(|v| !v.is_empty()).map(PathBuf::from));
     let tried: Vec<PathBuf> = folders.into_iter().map(|folder| folder.join(path)).collect();
-    match tried.iter().find(|path| path.is_dir()) {
+    match tried.iter().find(|path| path.exists()) {
         Some(found) => Ok(found.clone()),
         None => {
             let list: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
             bail!(
-                "no such folder: {} (looked for {}; {DATA_VARIABLE} can name the folder it is in)",
+                "no such file or folder: {} (looked for {}; {DATA_VARIABLE} can name the folder it is in)",
                 path.display(),
                 list.join(", ")
             )

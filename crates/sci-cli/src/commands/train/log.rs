@@ -30,8 +30,13 @@ enum Line {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Psnr {
-    sigma: f32,
+    /// Nothing for clips that were reconstructed from a measurement.
+    sigma: Option<f32>,
     psnr_db: f64,
+}
+
+fn legend(sigma: Option<f32>) -> String {
+    sigma.map_or_else(|| "reconstruction".into(), |sigma| format!("σ {sigma}"))
 }
 
 impl Line {
@@ -90,7 +95,7 @@ impl Log {
     pub(super) fn validation(&mut self, step: u64, scores: &[Score]) -> anyhow::Result<String> {
         let validation = scores.iter().map(|s| Psnr { sigma: s.sigma, psnr_db: s.psnr_db }).collect();
         self.write(Line::Validation { step, validation })?;
-        let scores: Vec<String> = scores.iter().map(|s| format!("σ {}: {:.2} dB", s.sigma, s.psnr_db)).collect();
+        let scores: Vec<String> = scores.iter().map(|s| format!("{}: {:.2} dB", legend(s.sigma), s.psnr_db)).collect();
         Ok(format!("step {step}   {}", scores.join("   ")))
     }
 
@@ -117,7 +122,7 @@ impl Log {
                 _ => None,
             })
             .collect();
-        let mut curves: Vec<(f32, Vec<(f64, f64)>)> = Vec::new();
+        let mut curves: Vec<Curve> = Vec::new();
         for line in &self.lines {
             let Line::Validation { step, validation } = line else { continue };
             for score in validation.iter().filter(|s| s.psnr_db.is_finite()) {
@@ -134,9 +139,12 @@ impl Log {
     }
 }
 
+/// σ, and PSNR over the steps.
+type Curve = (Option<f32>, Vec<(f64, f64)>);
+
 type DrawError = Box<dyn std::error::Error + Send + Sync>;
 
-fn draw(svg: &mut String, losses: &[(f64, f64)], curves: &[(f32, Vec<(f64, f64)>)]) -> Result<(), DrawError> {
+fn draw(svg: &mut String, losses: &[(f64, f64)], curves: &[Curve]) -> Result<(), DrawError> {
     let root = SVGBackend::with_string(svg, (900, 700)).into_drawing_area();
     root.fill(&WHITE)?;
     let (upper, lower) = root.split_vertically(350);
@@ -163,7 +171,7 @@ fn draw(svg: &mut String, losses: &[(f64, f64)], curves: &[(f32, Vec<(f64, f64)>
             let color = Palette99::pick(i).to_rgba();
             chart
                 .draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(2)))?
-                .label(format!("σ {sigma}"))
+                .label(legend(*sigma))
                 .legend(move |(x, y)| PathElement::new([(x, y), (x + 20, y)], color));
         }
         chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK).draw()?;
@@ -193,7 +201,7 @@ mod tests {
         let path = folder.path().join("log.jsonl");
         let mut log = Log::open(&path, 0).unwrap();
         (1..=40).for_each(|s| log.step(&report(s)).unwrap());
-        log.validation(40, &[Score { sigma: 25.0, psnr_db: 30.0 }]).unwrap();
+        log.validation(40, &[Score { sigma: Some(25.0), psnr_db: 30.0 }]).unwrap();
         log.flush().unwrap();
         let mut log = Log::open(&path, 20).unwrap();
         (21..=30).for_each(|s| log.step(&report(s)).unwrap());
@@ -210,7 +218,7 @@ mod tests {
         let mut log = Log::open(&folder.path().join("log.jsonl"), 0).unwrap();
         log.plot(&path).unwrap();
         (1..=20).for_each(|s| log.step(&report(s)).unwrap());
-        log.validation(20, &[Score { sigma: 25.0, psnr_db: 30.0 }]).unwrap();
+        log.validation(20, &[Score { sigma: Some(25.0), psnr_db: 30.0 }]).unwrap();
         log.plot(&path).unwrap();
         let svg = std::fs::read_to_string(&path).unwrap();
         assert!(svg.contains("training loss") && svg.contains("validation PSNR") && svg.contains("σ 25"));

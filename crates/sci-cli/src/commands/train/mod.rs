@@ -50,7 +50,11 @@ impl Args {
         catch_interrupts()?;
         let data = data::load(&config, &self.config)?;
         outln!("{} clips, {} photos, {} validation clips", data.videos.len(), data.photos.len(), data.validation.len());
+        let start = config.weights.as_ref().map(|path| data::weights(path, &self.config)).transpose()?;
         let mut trainer = Trainer::new(config, data)?;
+        if let Some(weights) = start {
+            trainer.start_from(&weights.into_tensors()).context("weights")?;
+        }
         outln!("{}, {} parameters", trainer.describe(), trainer.parameter_count());
         if self.resume {
             let resumed = trainer.resume(&checkpoint)?;

@@ -1,0 +1,85 @@
+//! What a solver asks a denoiser: measurements simulated from training clips with new random masks, solved by GAP with the
+//! network as it is. An iterate is no clean video with white noise; its error has the structure of the masks.
+
+use super::config::IteratesConfig;
+use crate::{Error, Result};
+use admm::{BoxError, Demosaicked, Denoiser, Gap, Plan, Problem, SolveError, Stage, Start, run};
+use ndarray::{Array2, Array3, Array4, ArrayView4, Axis};
+use rand::{Rng, RngExt};
+use sci_forward::bayer::{Menon, mosaic_into};
+use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoShape};
+
+/// A measurement and what made it.
+pub(super) struct Simulated {
+    operator: MaskOperator,
+    y: Array2<f32>,
+    /// The pattern of a color sensor.
+    cfa: Option<CfaPattern>,
+}
+
+impl Simulated {
+    /// A clip `[T, C, H, W]` seen through new masks: binary ones of a density drawn from the range, or, for the share
+    /// `gray_masks`, any transmittance; color clips through a sensor of one of the four patterns.
+    pub(super) fn random(clip: ArrayView4<'_, f32>, settings: &IteratesConfig, rng: &mut impl Rng) -> Result<Self> {
+        let (frames, channels, height, width) = clip.dim();
+        let shape = VideoShape { frames, height, width };
+        let [low, high] = settings.density;
+        let density = low + (high - low) * rng.random::<f64>();
+        let masks = if rng.random::<f64>() < settings.gray_masks {
+            MaskStack::new(Array3::from_shape_simple_fn(shape.dim(), || rng.random()))
+        } else {
+            MaskStack::random(shape, density, rng.random())
+        };
+        let operator = MaskOperator::new(masks.map_err(|e| Error::Data(e.to_string()))?);
+        let pattern = CfaPattern::ALL[rng.random_range(0..4)];
+        let cfa = (channels == 3).then_some(pattern);
+        let y = match cfa {
+            None => operator.forward(clip.index_axis(Axis(1), 0)),
+            Some(cfa) => {
+                let mut mosaic = Array3::zeros(shape.dim());
+                mosaic_into(cfa, clip, mosaic.view_mut());
+                operator.forward(mosaic.view())
+            }
+        };
+        Ok(Self { operator, y, cfa })
+    }
+
+    /// Accelerated GAP from the normalised measurement, one call of the denoiser for each σ; the result is gray or RGB.
+    ///
+    /// # Errors
+    /// That of the network, if it is one of this crate.
+    pub(super) fn solve(&self, sigmas: &[f32], denoiser: &mut dyn Denoiser) -> Result<Array4<f32>> {
+        let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: s / 255.0, iterations: 1 }).collect();
+        let plan = Plan::new(stages);
+        let problem = Problem::new(&self.operator, self.y.view()).map_err(typed)?;
+        let solved = match self.cfa {
+            None => run(&mut Gap::accelerated(denoiser), &problem, Start::Mean, &plan, &mut ()).map_err(typed)?.video(),
+            Some(cfa) => {
+                let mut gap = Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa));
+                run(&mut gap, &problem, Start::Mean, &plan, &mut ()).map_err(typed)?.video()
+            }
+        };
+        Ok(solved)
+    }
+}
+
+/// What is to be compared with the truth `[T, C, H, W]`.
+trait Video {
+    fn video(self) -> Array4<f32>;
+}
+
+impl<S> Video for admm::Outcome<S> {
+    fn video(self) -> Array4<f32> {
+        self.rgb.unwrap_or_else(|| self.estimate.insert_axis(Axis(1)))
+    }
+}
+
+/// The error of this crate that made a solver fail.
+fn typed(error: SolveError) -> Error {
+    let text = error.to_string();
+    let source: Option<BoxError> = match error {
+        SolveError::Denoiser { source, .. } => Some(source),
+        _ => None,
+    };
+    source.and_then(|s| s.downcast::<Error>().ok()).map_or(Error::Data(text), |e| *e)
+}
