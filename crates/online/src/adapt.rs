@@ -5,7 +5,7 @@ use crate::{
 };
 use admm::{BoxError, DenoiseCx, Denoiser};
 use candle_core::{Tensor, Var};
-use ndarray::{Array4, ArrayView4, ArrayViewMut4, Zip, s};
+use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, Zip, s};
 use nets::Network;
 use nets::train::Adam;
 use nets::weights::{Storage, WeightFile, write_safetensors};
@@ -266,7 +266,8 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         let train_on = noisier.as_ref().map_or(input, |noisier| noisier.view());
         for step in 0..self.config.schedule.steps {
             let known = (step == 0 && std == 0.0).then_some(before);
-            let grads = self.gradient(bound, cx, &vars, train_on, known, target, &mut rng)?;
+            let turn = (self.fired - 1) * self.config.schedule.steps + step;
+            let grads = self.gradient(bound, (cx, turn), &vars, train_on, known, target, &mut rng)?;
             let grads: Vec<_> = grads.into_iter().map(Some).collect();
             if !adam.apply(&grads, learning_rate, f64::INFINITY)?.is_finite() {
                 return Ok(None);
@@ -280,13 +281,13 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         Ok(after.is_finite().then_some((v, after)))
     }
 
-    /// The gradient of the loss with all its terms by each of `vars`. `known` is the output for `input`, if it is known;
-    /// `target` is the output before the update.
+    /// The gradient of the loss with all its terms by each of `vars`, in the turn `turn` through the frames that take turns.
+    /// `known` is the output for `input`, if it is known; `target` is the output before the update.
     #[expect(clippy::too_many_arguments, reason = "the state of one update, used once")]
     fn gradient(
         &mut self,
         bound: &Bound,
-        cx: &DenoiseCx,
+        (cx, turn): (&DenoiseCx, usize),
         vars: &[(String, Var)],
         input: ArrayView4<'_, f32>,
         known: Option<ArrayView4<'_, f32>>,
@@ -298,7 +299,10 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
             Some(v) => bound.snapshot.residual(v)?,
             None => bound.snapshot.residual(self.denoised(cx, input)?.view())?,
         };
-        let upstream = bound.snapshot.pull_back(bound.pixels.gradient(residual.view()).view());
+        let mut upstream = bound.snapshot.pull_back(bound.pixels.gradient(residual.view()).view());
+        let stride = self.config.schedule.stride.min(upstream.len_of(Axis(0)));
+        let others = upstream.outer_iter_mut().enumerate().filter(|(t, _)| t % stride != turn % stride);
+        others.for_each(|(_, mut frame)| frame.fill(0.0));
         accumulate_gradient(&self.net, vars, input, cx.sigma, upstream.view(), &mut sums)?;
 
         let terms = self.config.terms;

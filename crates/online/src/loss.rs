@@ -244,7 +244,8 @@ impl Pixels {
 /// Adds to `sums` the gradient of `⟨upstream, f(input)⟩` by each of `vars`: with `upstream = ∂ℓ/∂v`, the gradient of ℓ.
 ///
 /// `input` and `upstream` are `[T, C, H, W]`, `f` is `network` told `sigma`; `sums[i]` has the values of `vars[i]`.
-/// Activations are those of one window ([`Network::stages`]); windows are summed in their order.
+/// Activations are those of one window ([`Network::stages`]); windows are summed in their order. A window whose upstream is
+/// zero costs nothing.
 ///
 /// # Errors
 /// [`Error::Net`] as [`Network::forward`].
@@ -295,13 +296,16 @@ fn propagate(
     let frame = read.elem_count() / read.dim(0)?;
     let mut below = vec![0f32; if stage == 0 { 0 } else { read.elem_count() }];
     for window in windows {
+        let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
+        if values(&upstream)?.iter().all(|&v| v == 0.0) {
+            continue;
+        }
         let mut inputs = gather(read, window)?;
         let leaf = (stage > 0).then(|| Var::from_tensor(&inputs)).transpose()?;
         if let Some(leaf) = &leaf {
             inputs = leaf.as_tensor().clone();
         }
         let result = network.forward_window(stage, &inputs, sigma)?;
-        let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
         let grads = (result * upstream)?.sum_all()?.backward()?;
         for ((_, var), sum) in vars.iter().zip(&mut *sums) {
             if let Some(grad) = grads.get(var) {

@@ -16,6 +16,9 @@ pub struct Schedule {
     pub max_updates: Option<usize>,
     /// Steps of Adam in an update, at least 1.
     pub steps: usize,
+    /// The gradient is that of every so many frames only, in the next update (or step) of the others; 1 for all, as in the
+    /// paper. At least 1; more than there are frames is one of them. The residual is always that of all frames.
+    pub stride: usize,
     /// The learning rate.
     pub learning_rate: f64,
     /// Standard deviation of the noise added to the network's input for the steps (not for the output that is used);
@@ -34,6 +37,7 @@ impl Schedule {
         interval: 15,
         max_updates: None,
         steps: 2,
+        stride: 1,
         learning_rate: 2e-6,
         input_noise: 0.0,
         growth: 1.0,
@@ -69,6 +73,7 @@ impl Schedule {
         match self {
             s if s.interval == 0 => bad("interval", "0".into(), "at least 1"),
             s if s.steps == 0 => bad("steps", "0".into(), "at least 1"),
+            s if s.stride == 0 => bad("stride", "0".into(), "at least 1"),
             s if !(finite_at_least(s.learning_rate, 0.0) && s.learning_rate > 0.0) => {
                 bad("learning_rate", s.learning_rate.to_string(), "finite and greater than 0")
             }
@@ -133,6 +138,7 @@ mod tests {
         let bad = [
             Schedule { interval: 0, ..ok },
             Schedule { steps: 0, ..ok },
+            Schedule { stride: 0, ..ok },
             Schedule { learning_rate: 0.0, ..ok },
             Schedule { learning_rate: f64::NAN, ..ok },
             Schedule { input_noise: -1.0, ..ok },
@@ -142,6 +148,6 @@ mod tests {
             Err(Error::Setting { key, .. }) => key,
             other => panic!("{other:?}"),
         });
-        assert_eq!(keys, ["interval", "steps", "learning_rate", "learning_rate", "input_noise", "growth"]);
+        assert_eq!(keys, ["interval", "steps", "stride", "learning_rate", "learning_rate", "input_noise", "growth"]);
     }
 }

@@ -229,3 +229,32 @@ fn a_blinded_input_says_nothing_of_the_pixels_that_are_looked_at() {
     assert!((50..130).contains(&hidden), "{hidden} of 288");
     assert_eq!(Pixels::split(size, 0.1, 12).blinded(video.view()), None);
 }
+
+/// Frames that take turns: their gradients add up to that of all frames, and frames without one are left out.
+#[test]
+fn the_gradients_of_parts_of_the_frames_add_up() {
+    let shape = VideoShape { frames: 5, height: 8, width: 10 };
+    let snapshot = snapshot(shape, None);
+    let x = uniform((5, 1, 8, 10), 3);
+    let ffdnet = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0).unwrap();
+    let spec = FastdvdnetSpec { channels: 1, widths: [4, 8, 8], batch_norm: false };
+    let fastdvdnet = Fastdvdnet::random(spec, Ends::Circular, 0).unwrap();
+    parts_add_up(ffdnet, &snapshot, x.view());
+    parts_add_up(fastdvdnet, &snapshot, x.view());
+}
+
+fn parts_add_up<N: Network + Denoiser>(mut net: N, snapshot: &Snapshot, x: ArrayView4<'_, f32>) {
+    let pixels = Pixels::split(snapshot.shape().image_dim(), 0.0, 0);
+    let (vars, whole) = two_pass(&mut net, snapshot, &pixels, x, Parameters::All);
+    let upstream = upstream(&mut net, snapshot, &pixels, x);
+    let mut sums: Vec<Vec<f32>> = whole.iter().map(|g| vec![0.0; g.len()]).collect();
+    for turn in 0..2 {
+        let mut part = upstream.clone();
+        part.outer_iter_mut().enumerate().filter(|(t, _)| t % 2 != turn).for_each(|(_, mut f)| f.fill(0.0));
+        accumulate_gradient(&net, &vars, x, SIGMA, part.view(), &mut sums).unwrap();
+    }
+    let largest = whole.iter().flatten().fold(0f32, |m, v| m.max(v.abs()));
+    for (sum, whole) in sums.iter().flatten().zip(whole.iter().flatten()) {
+        assert!((sum - whole).abs() <= 1e-5 * largest, "{sum} {whole}");
+    }
+}

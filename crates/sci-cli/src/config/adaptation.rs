@@ -78,6 +78,7 @@ impl<'s> Checker<'s> {
             interval: whole("interval", &k.interval, 1..=MAX_ITERATIONS)?.map_or(preset.interval, |n| n as usize),
             max_updates: max_updates.map_or(preset.max_updates, |n| Some(n as usize)),
             steps: whole("steps", &k.steps, 1..=1000)?.map_or(preset.steps, |n| n as usize),
+            stride: whole("stride", &k.stride, 1..=1024)?.map_or(preset.stride, |n| n as usize),
             learning_rate: self
                 .number("online.learning_rate", &k.learning_rate, 1e-12..=1.0)?
                 .unwrap_or(preset.learning_rate),

@@ -176,6 +176,7 @@ pub struct OnlineKeys {
     pub interval: Value,
     pub max_updates: Value,
     pub steps: Value,
+    pub stride: Value,
     pub learning_rate: Value,
     pub input_noise: Value,
     pub growth: Value,

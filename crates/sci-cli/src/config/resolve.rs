@@ -408,6 +408,7 @@ fn online_json(o: &Online) -> Value {
         "interval": schedule.interval,
         "max_updates": schedule.max_updates,
         "steps": schedule.steps,
+        "stride": schedule.stride,
         "learning_rate": schedule.learning_rate,
         "input_noise": schedule.input_noise,
         "growth": schedule.growth,
