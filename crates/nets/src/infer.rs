@@ -2,7 +2,7 @@
 //! and a network's activations are those of one frame.
 
 use crate::Result;
-use crate::kernels::{Blocked, Conv3x3, LANES, PackedConv, Scratch};
+use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Scratch};
 use crate::layers::Conv;
 
 /// Packed convolutions and the images between them.
@@ -16,21 +16,25 @@ pub(crate) struct Engine {
 
 impl Engine {
     /// Packs the layers, batch norm folded. The outputs of the layers in `shuffled` are put in the order that
-    /// [`add_shuffled`] reads.
+    /// [`Engine::add_shuffled`] needs.
     pub(crate) fn new(convs: &[&Conv], shuffled: &[usize]) -> Result<Self> {
+        let isa = Isa::detect()?;
         let pack = |(i, conv): (usize, &&Conv)| {
-            let (weight, bias) = conv.folded()?;
-            let (outputs, inputs, ..) = weight.dims4()?;
-            let inputs = inputs * conv.opts().groups;
-            let values = weight.flatten_all()?.to_vec1::<f32>()?;
-            let bias = bias.map(|b| b.to_vec1::<f32>()).transpose()?;
-            let packed = if shuffled.contains(&i) {
-                let (outputs, values) = by_phase(&values, outputs);
-                PackedConv::new(&values, None, inputs, outputs, conv.opts())?
-            } else {
-                PackedConv::new(&values, bias.as_deref(), inputs, outputs, conv.opts())?
-            };
-            Ok((packed, conv.opts()))
+            let opts = conv.opts();
+            let mut filters = Filters::new(conv)?;
+            if i > 0 && convs[i - 1].opts().groups > 1 {
+                filters.spread_inputs(convs[i - 1].opts().groups);
+            }
+            if opts.groups > 1 {
+                filters.spread_outputs(opts.groups);
+            }
+            if shuffled.contains(&i) {
+                let block = if form(isa, filters.outputs / 4) == Form::Split { 2 * LANES } else { LANES };
+                filters.order_by_phase(block);
+            }
+            let Filters { inputs, outputs, values, bias } = filters;
+            let packed = PackedConv::new_on(isa, &values, bias.as_deref(), inputs, outputs, opts)?;
+            Ok((if shuffled.contains(&i) { packed } else { packed.giving(form(isa, outputs)) }, opts))
         };
         Ok(Self { convs: convs.iter().enumerate().map(pack).collect::<Result<_>>()?, ..Self::default() })
     }
@@ -43,11 +47,15 @@ impl Engine {
         }
     }
 
-    /// An image whose border is zero and whose pixels are unspecified.
+    /// An f32 image whose border is zero and whose pixels are unspecified.
     pub(crate) fn image(&mut self, channels: usize, height: usize, width: usize) -> Blocked {
-        match self.free.iter().position(|image| image.shape() == (channels, height, width)) {
+        self.image_of(Form::Single, (channels, height, width))
+    }
+
+    fn image_of(&mut self, form: Form, shape: (usize, usize, usize)) -> Blocked {
+        match self.free.iter().position(|image| (image.form(), image.shape()) == (form, shape)) {
             Some(i) => self.free.swap_remove(i),
-            None => Blocked::zeros(channels, height, width),
+            None => Blocked::of(form, shape),
         }
     }
 
@@ -60,9 +68,23 @@ impl Engine {
     pub(crate) fn conv(&mut self, i: usize, input: &Blocked) -> Result<Blocked> {
         let stride = self.convs[i].1.stride;
         let ((_, outputs), (_, h, w)) = (self.convs[i].0.channels(), input.shape());
-        let mut output = self.image(outputs, h.div_ceil(stride), w.div_ceil(stride));
+        let shape = (outputs, h.div_ceil(stride), w.div_ceil(stride));
+        let mut output = self.image_of(self.convs[i].0.form(), shape);
         self.convs[i].0.forward(input, &mut output, &mut self.scratch)?;
         Ok(output)
+    }
+
+    /// Adds the pixel-shuffled result of layer `i` to `image`; the input is taken back.
+    pub(crate) fn add_shuffled(&mut self, i: usize, input: Blocked, image: &mut Blocked) -> Result<()> {
+        if image.form() == Form::Split {
+            self.convs[i].0.add_shuffled(&input, image, &mut self.scratch)?;
+        } else {
+            let quarters = self.conv(i, &input)?;
+            add_shuffled(&quarters, image);
+            self.recycle(quarters);
+        }
+        self.recycle(input);
+        Ok(())
     }
 
     /// Layers one after another; the images between them, and the input, are taken back.
@@ -104,22 +126,74 @@ impl Cache {
     }
 }
 
-/// Filters `[4C, …]` for a pixel shuffle, in the order `[phase][C]`, each phase filled up with zeros to whole blocks.
-fn by_phase(weights: &[f32], outputs: usize) -> (usize, Vec<f32>) {
-    let filter = weights.len() / outputs;
-    let channels = outputs / 4;
-    let padded = channels.next_multiple_of(LANES);
-    let mut ordered = vec![0.0; 4 * padded * filter];
-    for (i, values) in weights.chunks_exact(filter).enumerate() {
-        let (channel, phase) = (i / 4, i % 4);
-        let at = (phase * padded + channel) * filter;
-        ordered[at..at + filter].copy_from_slice(values);
+/// How the images between layers are held: split for the matrix unit, but for those that it would not gain from.
+fn form(isa: Isa, channels: usize) -> Form {
+    if isa == Isa::Amx && channels > LANES { Form::Split } else { Form::Single }
+}
+
+/// A layer's filters `[Cout, Cin/groups, 3, 3]`, batch norm folded, to be put in the order that suits the kernels.
+struct Filters {
+    inputs: usize,
+    outputs: usize,
+    values: Vec<f32>,
+    bias: Option<Vec<f32>>,
+}
+
+impl Filters {
+    fn new(conv: &Conv) -> Result<Self> {
+        let (weight, bias) = conv.folded()?;
+        let (outputs, each, ..) = weight.dims4()?;
+        let values = weight.flatten_all()?.to_vec1::<f32>()?;
+        let bias = bias.map(|b| b.to_vec1::<f32>()).transpose()?;
+        Ok(Self { inputs: each * conv.opts().groups, outputs, values, bias })
     }
-    (4 * padded, ordered)
+
+    /// Fills up the outputs of each group with zeros to whole pairs of blocks, so that no panel of outputs has the
+    /// inputs of two groups.
+    fn spread_outputs(&mut self, groups: usize) {
+        let filter = self.values.len() / self.outputs;
+        let each = self.outputs / groups;
+        self.values = filled_up(&self.values, each * filter, wide(each) * filter);
+        self.bias = self.bias.take().map(|b| filled_up(&b, each, wide(each)));
+        self.outputs = groups * wide(each);
+    }
+
+    /// As the layer before has spread its outputs.
+    fn spread_inputs(&mut self, groups: usize) {
+        let each = self.inputs / groups;
+        self.values = filled_up(&self.values, each * 9, wide(each) * 9);
+        self.inputs = groups * wide(each);
+    }
+
+    /// Puts the outputs, of a pixel shuffle, in the order `[phase][C]`, each phase filled up with zeros to whole blocks
+    /// of `block` channels. They have no bias.
+    fn order_by_phase(&mut self, block: usize) {
+        let filter = self.values.len() / self.outputs;
+        let channels = self.outputs / 4;
+        let padded = channels.next_multiple_of(block);
+        let mut ordered = vec![0.0; 4 * padded * filter];
+        for (i, values) in self.values.chunks_exact(filter).enumerate() {
+            let (channel, phase) = (i / 4, i % 4);
+            let at = (phase * padded + channel) * filter;
+            ordered[at..at + filter].copy_from_slice(values);
+        }
+        (self.outputs, self.values, self.bias) = (4 * padded, ordered, None);
+    }
+}
+
+/// Channels of a group in whole pairs of blocks.
+fn wide(each: usize) -> usize {
+    each.next_multiple_of(2 * LANES)
+}
+
+/// Every `each` numbers followed by zeros, `wide` in all.
+fn filled_up(values: &[f32], each: usize, wide: usize) -> Vec<f32> {
+    let zeros = std::iter::repeat_n(0.0, wide - each);
+    values.chunks_exact(each).flat_map(|group| group.iter().copied().chain(zeros.clone())).collect()
 }
 
 /// `image += pixel_shuffle(quarters)`: phase `2i + j` of `quarters` goes to the pixels `(2y + i, 2x + j)`.
-pub(crate) fn add_shuffled(quarters: &Blocked, image: &mut Blocked) {
+fn add_shuffled(quarters: &Blocked, image: &mut Blocked) {
     let (_, height, width) = quarters.shape();
     let blocks = image.blocks();
     for block in 0..blocks {

@@ -2,6 +2,7 @@
 
 use super::KernelError;
 use super::simd::{Isa, LANES, Simd, entry};
+use rayon::prelude::*;
 
 /// One block of channels at one pixel: a cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -10,12 +11,28 @@ pub(super) struct Pixel(pub(super) [f32; LANES]);
 
 pub(super) const ZERO: Pixel = Pixel([0.0; LANES]);
 
+/// How an image holds its numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Form {
+    /// f32, 16 channels a block.
+    #[default]
+    Single,
+    /// Two bf16 numbers whose sum it is to 17 bits; 32 channels in two blocks, the second for what the first lacks.
+    Split,
+}
+
+/// Pixels after the last one: tiles of the matrix unit end where a row does only if it has whole ones.
+pub(super) const SLACK: usize = 96;
+
 /// One image of any number of channels as `[⌈C/16⌉][1 + ⌈H⌉₄ + 1][1 + ⌈W⌉₄ + 1][16]` (`⌈·⌉₄`: up to a multiple of 4).
+///
+/// For the matrix unit two blocks hold 32 channels as pairs of bf16 numbers instead ([`Form::Split`]).
 ///
 /// The border is zero, so that a 3×3 filter, or a Winograd tile of 6×6, never has to look where it is. The lanes beyond
 /// the last channel hold nothing: kernels write zeros there and never read them.
 #[derive(Debug, Clone, Default)]
 pub struct Blocked {
+    form: Form,
     channels: usize,
     height: usize,
     width: usize,
@@ -30,19 +47,33 @@ pub(super) fn padded(n: usize) -> usize {
 impl Blocked {
     /// An image of zeros.
     pub fn zeros(channels: usize, height: usize, width: usize) -> Self {
+        Self::of(Form::Single, (channels, height, width))
+    }
+
+    /// As [`Blocked::zeros`], in the given form.
+    pub(crate) fn of(form: Form, (channels, height, width): (usize, usize, usize)) -> Self {
         let mut image = Self::default();
-        image.resize(channels, height, width);
+        image.reform(form, channels, height, width);
         image
     }
 
     /// Takes on another shape; the content is unspecified unless the shape stays. Allocates only when it grows.
     pub fn resize(&mut self, channels: usize, height: usize, width: usize) {
-        if (channels, height, width) == self.shape() {
+        self.reform(Form::Single, channels, height, width);
+    }
+
+    /// As [`Blocked::resize`], in the given form.
+    pub(crate) fn reform(&mut self, form: Form, channels: usize, height: usize, width: usize) {
+        if (form, channels, height, width) == (self.form, self.channels, self.height, self.width) {
             return;
         }
-        (self.channels, self.height, self.width) = (channels, height, width);
+        (self.form, self.channels, self.height, self.width) = (form, channels, height, width);
         self.data.clear();
-        self.data.resize(self.blocks() * padded(height) * padded(width), ZERO);
+        self.data.resize(self.blocks() * padded(height) * padded(width) + SLACK, ZERO);
+    }
+
+    pub(crate) fn form(&self) -> Form {
+        self.form
     }
 
     /// `(channels, height, width)`.
@@ -52,10 +83,14 @@ impl Blocked {
 
     /// Number of channel blocks, `⌈C/16⌉`.
     pub fn blocks(&self) -> usize {
-        self.channels.div_ceil(LANES)
+        match self.form {
+            Form::Single => self.channels.div_ceil(LANES),
+            Form::Split => 2 * self.channels.div_ceil(2 * LANES),
+        }
     }
 
     fn first_pixel(&self, block: usize, y: usize) -> usize {
+        assert_eq!(self.form, Form::Single, "the numbers of a split image");
         assert!(
             block < self.blocks() && y < self.height,
             "block {block}, row {y} of {} blocks, {} rows",
@@ -125,6 +160,14 @@ impl Blocked {
             unpack(isa, self.view().inner(), planes);
         }
         Ok(())
+    }
+
+    /// The rows of a channel block in parallel.
+    pub(crate) fn par_rows_mut(&mut self, block: usize) -> impl IndexedParallelIterator<Item = &mut [[f32; LANES]]> {
+        let (width, row) = (self.width, padded(self.width));
+        let first = self.first_pixel(block, 0) - 1;
+        let rows = &mut floats_mut(&mut self.data)[first * LANES..][..self.height * row * LANES];
+        rows.as_chunks_mut::<LANES>().0.par_chunks_exact_mut(row).map(move |row| &mut row[1..=width])
     }
 
     pub(super) fn view(&self) -> View {

@@ -1,6 +1,8 @@
 //! A convolution ready to run: its algorithm chosen, its filters packed.
 
-use super::blocked::{Blocked, Pixel, Planes, ViewMut, ZERO, padded, unpack};
+#[cfg(target_arch = "x86_64")]
+use super::amx;
+use super::blocked::{Blocked, Form, Pixel, Planes, SLACK, View, ViewMut, ZERO, padded, unpack};
 use super::scratch::{Scratch, Slot, band};
 use super::simd::{Isa, LANES};
 use super::{KernelError, Step, Strip, Weights, direct, winograd};
@@ -9,6 +11,8 @@ use super::{KernelError, Step, Strip, Weights, direct, winograd};
 enum Filters {
     Winograd(winograd::Winograd),
     Direct(direct::Direct),
+    #[cfg(target_arch = "x86_64")]
+    Amx(amx::Amx),
 }
 
 /// A 3×3 convolution with zero padding 1, its filters transformed and packed once for many calls:
@@ -23,6 +27,8 @@ pub struct PackedConv {
     bias: Vec<Pixel>,
     /// Lower bound of the result: 0 for ReLU, else −∞.
     floor: f32,
+    /// Of the result.
+    form: Form,
 }
 
 /// Whether Winograd's way is the faster; see the module header for the measurements behind the constants.
@@ -82,10 +88,13 @@ impl PackedConv {
     /// Without bias and ReLU; `isa` is available.
     pub(super) fn pack(isa: Isa, weights: &Weights<'_>, step: Step) -> Self {
         let (inputs, outputs) = (weights.inputs, weights.outputs);
-        let filters = if prefers_winograd(inputs, outputs, weights.groups, step) {
-            Filters::Winograd(winograd::Winograd::new(weights, isa.vecs()))
-        } else {
-            Filters::Direct(direct::Direct::new(weights, step, isa.vecs()))
+        let filters = match isa {
+            #[cfg(target_arch = "x86_64")]
+            Isa::Amx if prefers_matrix_unit(inputs, weights.groups, step) => Filters::Amx(amx::Amx::new(weights, step)),
+            _ if prefers_winograd(inputs, outputs, weights.groups, step) => {
+                Filters::Winograd(winograd::Winograd::new(weights, isa.vecs()))
+            }
+            _ => Filters::Direct(direct::Direct::new(weights, step, isa.vecs())),
         };
         Self {
             isa,
@@ -95,6 +104,26 @@ impl PackedConv {
             filters,
             bias: vec![ZERO; outputs.div_ceil(LANES)],
             floor: f32::NEG_INFINITY,
+            form: Form::Single,
+        }
+    }
+
+    /// Gives its result in that form; [`Form::Split`] is for [`Isa::Amx`].
+    pub(crate) fn giving(self, form: Form) -> Self {
+        debug_assert!(form == Form::Single || self.isa == Isa::Amx, "{:?} has no split images", self.isa);
+        Self { form, ..self }
+    }
+
+    pub(crate) fn form(&self) -> Form {
+        self.form
+    }
+
+    /// The form in which it multiplies its input.
+    fn input_form(&self) -> Form {
+        match self.filters {
+            #[cfg(target_arch = "x86_64")]
+            Filters::Amx(_) => Form::Split,
+            _ => Form::Single,
         }
     }
 
@@ -109,23 +138,78 @@ impl PackedConv {
     /// # Errors
     /// [`KernelError::Channels`] or [`KernelError::Empty`].
     pub fn forward(&self, input: &Blocked, output: &mut Blocked, scratch: &mut Scratch) -> Result<(), KernelError> {
-        let (channels, height, width) = input.shape();
-        self.check(channels, [1, channels, height, width])?;
+        let (_, height, width) = input.shape();
         let (out_h, out_w) = (self.step.out_size(height), self.step.out_size(width));
-        output.resize(self.outputs, out_h, out_w);
-        let (src, dst) = (input.view(), output.view_mut().inner());
-        let each = strip_rows(out_w);
+        self.check_image(input)?;
+        output.reform(self.form, self.outputs, out_h, out_w);
+        let dst = output.view_mut().inner();
+        // SAFETY: strips write disjoint rows of the output.
+        unsafe { self.strips(input, Store::As(self.form), |y| dst.down(y), scratch) }
+        Ok(())
+    }
+
+    /// Adds the pixel-shuffled result to a split image of twice the size: phase `2i + j` of the outputs to the pixels
+    /// `(2y + i, 2x + j)`.
+    ///
+    /// # Errors
+    /// [`KernelError::Form`] when either is for f32, else as [`PackedConv::forward`].
+    ///
+    /// # Panics
+    /// When the output channels are not four times those of the image, in whole pairs of blocks.
+    pub(crate) fn add_shuffled(
+        &self,
+        input: &Blocked,
+        image: &mut Blocked,
+        scratch: &mut Scratch,
+    ) -> Result<(), KernelError> {
+        let (_, height, width) = input.shape();
+        self.check_image(input)?;
+        if self.input_form() != Form::Split || image.form() != Form::Split {
+            return Err(KernelError::Form);
+        }
+        assert_eq!(
+            (4 * image.blocks() * LANES, 2 * height, 2 * width),
+            (self.outputs, image.shape().1, image.shape().2)
+        );
+        let dst = image.view_mut().inner();
+        // SAFETY: strips write disjoint rows of the image.
+        unsafe { self.strips(input, Store::AddShuffled, |y| dst.down(2 * y), scratch) }
+        Ok(())
+    }
+
+    /// # Safety
+    /// `dst(y)` must be where output row `y` can be written.
+    unsafe fn strips(
+        &self,
+        input: &Blocked,
+        store: Store,
+        dst: impl Fn(usize) -> ViewMut + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let (_, height, width) = input.shape();
+        let (out_h, out_w) = (self.step.out_size(height), self.step.out_size(width));
+        let (src, each) = (input.view(), strip_rows(out_w));
         scratch.each(out_h.div_ceil(each), |i, slot| {
             let y = i * each;
-            let strip = Strip {
-                src: src.down(self.step.first_row(y)),
-                dst: dst.down(y),
-                rows: each.min(out_h - y),
-                width: out_w,
-            };
-            // SAFETY: the padded input has the rows that the strip reads; strips write disjoint rows of the output.
-            unsafe { self.strip(strip, slot) }
+            let mut src = src.down(self.step.first_row(y));
+            let rows = each.min(out_h - y);
+            // SAFETY: the padded input has the rows that the strip reads.
+            unsafe {
+                if input.form() != self.input_form() {
+                    let count = (self.step.first_row(rows - 1) + 3) * padded(width);
+                    src = split_copy(src, self.inputs, count, slot);
+                }
+                self.strip(Strip { src, dst: dst(y), rows, width: out_w }, store, slot);
+            }
         });
+    }
+
+    fn check_image(&self, input: &Blocked) -> Result<(), KernelError> {
+        let (channels, height, width) = input.shape();
+        self.check(channels, [1, channels, height, width])?;
+        if input.form() == Form::Split && self.input_form() == Form::Single {
+            return Err(KernelError::Form);
+        }
         Ok(())
     }
 
@@ -172,10 +256,14 @@ impl PackedConv {
                 let first = self.step.first_row(y);
                 let read = self.step.input_rows(rows);
                 let src = band(self.isa, planes, 1, first, read, padded(width), &mut slot.src);
+                if self.input_form() == Form::Split {
+                    let dst = ViewMut { ptr: slot.src.as_mut_ptr(), block: src.block, row: src.row };
+                    split(src, channels, read * padded(width), dst);
+                }
                 let blocks = self.outputs.div_ceil(LANES);
                 slot.dst.grow(blocks * rows * out_w * LANES);
                 let dst = ViewMut { ptr: slot.dst.as_mut_ptr(), block: rows * out_w * LANES, row: out_w * LANES };
-                self.strip(Strip { src, dst, rows, width: out_w }, slot);
+                self.strip(Strip { src, dst, rows, width: out_w }, Store::As(Form::Single), slot);
                 let plane = out_h * out_w;
                 let result = Planes {
                     ptr: output.at(image * self.outputs * plane + y * out_w),
@@ -192,19 +280,77 @@ impl PackedConv {
 
     /// # Safety
     /// The strip's memory must be valid.
-    unsafe fn strip(&self, strip: Strip, slot: &mut Slot) {
+    unsafe fn strip(&self, strip: Strip, store: Store, slot: &mut Slot) {
         // SAFETY: the caller's contract; `isa` was checked when this was made.
         unsafe {
             match &self.filters {
-                Filters::Winograd(f) => {
-                    winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot);
-                }
-                Filters::Direct(f) => {
-                    direct::forward(self.isa, f, &self.bias, self.floor, strip, slot);
-                }
+                #[cfg(target_arch = "x86_64")]
+                Filters::Amx(f) => amx::forward(f, &self.bias, self.floor, strip, store, slot),
+                _ if store == Store::As(Form::Split) => self.strip_then_split(strip, slot),
+                Filters::Winograd(f) => winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot),
+                Filters::Direct(f) => direct::forward(self.isa, f, &self.bias, self.floor, strip, slot),
             }
         }
     }
+
+    /// # Safety
+    /// The strip's memory must be valid.
+    unsafe fn strip_then_split(&self, strip: Strip, slot: &mut Slot) {
+        let Strip { dst, rows, width, .. } = strip;
+        let (row, blocks) = (width * LANES, self.outputs.div_ceil(LANES));
+        slot.dst.grow(blocks * rows * row);
+        let whole = ViewMut { ptr: slot.dst.as_mut_ptr(), block: rows * row, row };
+        // SAFETY: the caller's contract; `whole` has room for the result.
+        unsafe {
+            self.strip(Strip { dst: whole, ..strip }, Store::As(Form::Single), slot);
+            for y in 0..rows {
+                split(whole.shared().down(y), self.outputs, width, dst.down(y));
+            }
+        }
+    }
+}
+
+/// What becomes of a result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Store {
+    /// It is written.
+    As(Form),
+    /// Its channels are four phases of an image of twice the size, in whole pairs of blocks each. They are added to the
+    /// split image that is there.
+    AddShuffled,
+}
+
+/// Whether the matrix unit is the faster; of up to 16 channels it would waste half and more.
+#[cfg(target_arch = "x86_64")]
+fn prefers_matrix_unit(inputs: usize, groups: usize, step: Step) -> bool {
+    groups == 1 && inputs > LANES && step != Step::Double
+}
+
+/// `count` pixels, split, in the slot's source buffer.
+///
+/// # Safety
+/// `src` must have the pixels, and the processor the matrix unit.
+unsafe fn split_copy(src: View, channels: usize, count: usize, slot: &mut Slot) -> View {
+    let block = count * LANES;
+    slot.src.grow(channels.div_ceil(2 * LANES) * 2 * block + SLACK * LANES);
+    let dst = ViewMut { ptr: slot.src.as_mut_ptr(), block, row: src.row };
+    // SAFETY: the caller's contract.
+    unsafe { split(src, channels, count, dst) };
+    dst.shared()
+}
+
+/// Splits `count` pixels of `channels` channels in a row; `src` and `dst` may be the same.
+///
+/// # Safety
+/// As that of the function called.
+unsafe fn split(src: View, channels: usize, count: usize, dst: ViewMut) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: the caller's contract.
+    unsafe {
+        amx::split(src, channels, count, dst);
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    unreachable!("{count} pixels of {channels} channels from {:p} to {:p}: no split images here", src.ptr, dst.ptr);
 }
 
 /// Output rows worked on at once: whole tiles, enough of them to keep the products wide, few enough for the cache.

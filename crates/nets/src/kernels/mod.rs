@@ -8,11 +8,14 @@
 //!
 //! * Layout: channels in blocks of 16, one block of one pixel a cache line, a border of zeros around the image
 //!   ([`Blocked`]). Planes are copied to that layout a strip at a time, where they stay in the second-level cache.
-//! * Every multiplication is done by one of two register tiles (`tile`): pixels × 16 or 32 output channels, or, for the
+//! * Where the processor has AMX and `SCI_KERNEL=amx` asks for it, convolutions of more than 16 channels are done by the
+//!   definition on its matrix unit (`amx`), each number as the sum of two bf16 ones. Images between the layers of a
+//!   network stay in that form. The error is five times that of AVX-512 (below).
+//! * Every other multiplication is done by one of two register tiles (`tile`): pixels × 16 or 32 output channels, or, for the
 //!   weight gradient, input × output channels. They are written once over a 16-lane vector (`simd`) and compiled for
 //!   AVX-512 (14 × 2 registers), AVX2 with FMA (6 × 2), NEON (6 × 4) and plain Rust. [`Isa::detect`] takes the best that
-//!   the machine has, `SCI_KERNEL=avx512|avx2|neon|portable` another one, [`conv3x3_on`] and [`PackedConv::new_on`] any.
-//! * Stride 1 is done by Winograd F(4×4, 3×3) (`winograd`): 32 tiles at a time are transformed, multiplied in 36 small
+//!   the machine has, `SCI_KERNEL=amx|avx512|avx2|neon|portable` another one, [`conv3x3_on`] and [`PackedConv::new_on`] any.
+//! * Elsewhere stride 1 is done by Winograd F(4×4, 3×3) (`winograd`): 32 tiles at a time are transformed, multiplied in 36 small
 //!   matrix products and transformed back with bias and ReLU, so that both transforms (0.3 MB each at 64 channels) and
 //!   most of the filters stay in the second-level cache. The weight gradient is the adjoint of the same steps.
 //! * Stride 2, its gradient by input (four parities of output pixels), groups and very few input channels are done by
@@ -45,18 +48,40 @@
 //!   2.4 (2.5), the choice, which oneDNN made too. All cost the same. F(2×2, 3×3) has 0.8 (0.6), direct 1.4 (1.4).
 //! * Candle's tensors: fresh memory for every result made [`conv3x3`] half as fast as now; [`keep_freed_memory`] cures
 //!   it. Prefetching the lines that a strip's result will be written to gives 0 to 5 %.
-//! * Not tried: AMX or bf16 products (their 8-bit mantissa would need three products to keep f32 accuracy).
+//!
+//! # The matrix unit
+//!
+//! Whole passes over 8 frames of 256×256, 2 threads, in turn (ms): by AVX-512 alone FFDNet gray 147, color 239,
+//! FastDVDnet gray 576; with AMX 103, 163, 331.
+//!
+//! * The unit does 1,700 GMAC/s a core with zeros, 1,275 with other numbers (its clock falls): 425 of products of three
+//!   parts, where the direct tile has 115. 2×2 tiles of 16×16 hide all loads; 4×1 tiles are 6 % slower.
+//! * Storing, rounding and splitting a result beside the multiplication of the next: 16 %. Shuffled channels are added
+//!   where they are stored: afterwards it took 3 %, on one thread.
+//! * Outputs of each group of a grouped convolution in blocks of their own (90 channels become 96): 40 % fewer products
+//!   in FastDVDnet's first layer.
+//! * Asking for the next row early: up to 10 % in a loop over one layer, but 5 to 15 % slower in networks: not done.
+//! * FastDVDnet has 2.6 times the products of FFDNet and takes 3.2 times as long. Its features at full size are 25 MB a
+//!   frame, more than the second-level cache holds: 80 % of the time goes into the unit's loop, at 60 % of its speed
+//!   (FFDNet 75 %); 6 % into splitting the first layer's results, 4 % into computing them.
+//! * Training gains nothing: a step of FFDNet takes 121 to 137 ms, 120 to 123 by AVX-512.
+//! * Not tried: the first two layers of FastDVDnet in bands of rows, without the image between them; its noise map as a
+//!   bias (at most 2 %); whole frames in parallel; AMX for the weight gradient.
 //!
 //! # Error
 //!
 //! Against f64, inputs uniform in [-4, 4], weights N(0, 2/(9·Cin)), 40×40 pixels; results have an RMS of 3.2. A test
 //! holds these to twice the values:
 //!
+//! With AMX, both channels: 6.2e-5 (1.3e-5); 1.5e-5 (3.3e-6); 1.6e-4 (2.9e-5), which is AVX-512's.
+//!
 //! | channels | result, max (RMS)   | gradient by input, of RMS 0.8 | gradient by weight, of RMS 52 |
 //! |----------|---------------------|-------------------------------|-------------------------------|
 //! | 64       | 2.5e-5 (2.4e-6)     | 5.9e-6 (6.0e-7)               | 1.6e-4 (2.9e-5)               |
 //! | 96       | 2.8e-5 (2.9e-6)     | 6.9e-6 (7.2e-7)               | 1.6e-4 (2.9e-5)               |
 
+#[cfg(target_arch = "x86_64")]
+mod amx;
 mod blocked;
 mod conv;
 mod direct;
@@ -77,6 +102,7 @@ pub use peak::gemm_peak;
 pub use scratch::Scratch;
 pub use simd::{Isa, LANES};
 
+pub(crate) use blocked::Form;
 use blocked::{View, ViewMut};
 
 /// A rule of the kernels that a call broke.
@@ -84,7 +110,7 @@ use blocked::{View, ViewMut};
 #[non_exhaustive]
 pub enum KernelError {
     /// `SCI_KERNEL` names no instruction set.
-    #[error("SCI_KERNEL is {0:?}; it can be avx512, avx2, neon or portable")]
+    #[error("SCI_KERNEL is {0:?}; it can be amx, avx512, avx2, neon or portable")]
     UnknownIsa(String),
     /// This machine lacks the instruction set.
     #[error("this machine has no {0}")]
@@ -105,6 +131,9 @@ pub enum KernelError {
         /// Of the image.
         found: usize,
     },
+    /// The image is in the form of the matrix unit, the convolution is not for it.
+    #[error("a split image goes into a convolution of f32 numbers")]
+    Form,
     /// The stride is neither 1 nor 2.
     #[error("stride {0}; it can be 1 or 2")]
     Stride(usize),

@@ -1,6 +1,6 @@
 //! Memory that calls reuse, and how work is shared out.
 
-use super::blocked::{Pixel, Planes, View, ViewMut, ZERO, pack};
+use super::blocked::{Pixel, Planes, SLACK, View, ViewMut, ZERO, pack};
 use super::simd::{Isa, LANES};
 use super::tile::Run;
 use rayon::prelude::*;
@@ -103,7 +103,8 @@ pub(super) unsafe fn band(
     let line = padded_width * LANES;
     let block = rows * line;
     let blocks = image.channels.div_ceil(LANES);
-    buffer.grow(blocks * block);
+    // room to split the numbers where they are
+    buffer.grow(blocks.next_multiple_of(2) * block + SLACK * LANES);
     let pixels = &mut buffer.pixels()[..blocks * rows * padded_width];
     // rows of the band that the image has
     let from = top.saturating_sub(first).min(rows);

@@ -13,6 +13,8 @@ pub const LANES: usize = 16;
 /// An instruction set that the kernels are compiled for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Isa {
+    /// x86-64 with AMX for bf16: AVX-512F, but products of more than 16 input channels on the matrix unit, to 17 bits.
+    Amx,
     /// x86-64 with AVX-512F: a vector is one register.
     Avx512,
     /// x86-64 with AVX2 and FMA: a vector is two registers.
@@ -25,11 +27,12 @@ pub enum Isa {
 
 impl Isa {
     /// All of them, the fastest first.
-    pub const ALL: [Self; 4] = [Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
+    pub const ALL: [Self; 5] = [Self::Amx, Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
 
     /// The name that `SCI_KERNEL` knows it by.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Amx => "amx",
             Self::Avx512 => "avx512",
             Self::Avx2 => "avx2",
             Self::Neon => "neon",
@@ -40,6 +43,8 @@ impl Isa {
     /// Whether this machine has it.
     pub fn available(self) -> bool {
         match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Amx => super::amx::available(),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => is_x86_feature_detected!("avx512f"),
             #[cfg(target_arch = "x86_64")]
@@ -52,7 +57,8 @@ impl Isa {
         }
     }
 
-    /// The one to use: `SCI_KERNEL` if it is set, else the fastest that this machine has. Read once per process.
+    /// The one to use: `SCI_KERNEL` if it is set, else the fastest that this machine has but for [`Isa::Amx`], whose
+    /// greater error must be asked for. Read once per process.
     ///
     /// # Errors
     /// [`KernelError::UnknownIsa`] or [`KernelError::MissingIsa`] when `SCI_KERNEL` asks for what there is not.
@@ -62,7 +68,7 @@ impl Isa {
             .get_or_init(|| match std::env::var("SCI_KERNEL") {
                 Ok(name) => Self::named(&name),
                 Err(std::env::VarError::NotPresent) => {
-                    Ok(Self::ALL.into_iter().find(|isa| isa.available()).unwrap_or(Self::Portable))
+                    Ok(Self::ALL.into_iter().find(|isa| *isa != Self::Amx && isa.available()).unwrap_or(Self::Portable))
                 }
                 Err(std::env::VarError::NotUnicode(name)) => {
                     Err(KernelError::UnknownIsa(name.to_string_lossy().into()))
@@ -88,7 +94,7 @@ impl Isa {
 
     /// Vectors of output channels that one register tile holds ([`Simd::VECS`]).
     pub(super) fn vecs(self) -> usize {
-        if self == Self::Avx512 { 2 } else { 1 }
+        if matches!(self, Self::Amx | Self::Avx512) { 2 } else { 1 }
     }
 }
 
@@ -445,7 +451,7 @@ macro_rules! entry {
             unsafe {
                 match isa {
                     #[cfg(target_arch = "x86_64")]
-                    $crate::kernels::simd::Isa::Avx512 => avx512($($arg),*),
+                    $crate::kernels::simd::Isa::Amx | $crate::kernels::simd::Isa::Avx512 => avx512($($arg),*),
                     #[cfg(target_arch = "x86_64")]
                     $crate::kernels::simd::Isa::Avx2 => avx2($($arg),*),
                     #[cfg(target_arch = "aarch64")]

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
+use nets::kernels::keep_freed_memory;
 use nets::train::{TrainConfig, Trainer};
 use nets::weights::Storage;
 
@@ -48,6 +49,7 @@ impl Args {
         }
         std::fs::create_dir_all(&out).with_context(|| format!("cannot create {}", out.display()))?;
         catch_interrupts()?;
+        keep_freed_memory();
         let data = data::load(&config, &self.config)?;
         outln!("{} clips, {} photos, {} validation clips", data.videos.len(), data.photos.len(), data.validation.len());
         let start = config.weights.as_ref().map(|path| data::weights(path, &self.config)).transpose()?;
