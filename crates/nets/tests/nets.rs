@@ -49,6 +49,9 @@ fn assert_close(a: &Array4<f32>, b: &Array4<f32>, tolerance: f32) {
     assert!(worst <= tolerance && a.iter().all(|v| v.is_finite()), "differ by {worst:e}");
 }
 
+/// Inference may use the matrix unit and the tensors do not: as far as golden outputs may be off.
+const TOLERANCE: f32 = 1e-4;
+
 const ODD_SIZES: [(usize, usize); 6] = [(1, 1), (1, 9), (9, 1), (3, 5), (2, 6), (33, 31)];
 
 #[test]
@@ -57,10 +60,10 @@ fn frames_of_any_size_pass_and_both_paths_agree() {
         for frames in [1, 2, 3, 5] {
             let (gray, rgb) = (pattern((frames, 1, h, w)), pattern((frames, 3, h, w)));
             let mut ffdnet = tiny_ffdnet(1);
-            assert_close(&denoise(&mut ffdnet, &gray), &by_tensors(&ffdnet, &gray), 1e-5);
+            assert_close(&denoise(&mut ffdnet, &gray), &by_tensors(&ffdnet, &gray), TOLERANCE);
             for ends in [Ends::Circular, Ends::Mirrored] {
                 let mut net = tiny_fastdvdnet(3, ends);
-                assert_close(&denoise(&mut net, &rgb), &by_tensors(&net, &rgb), 2e-5);
+                assert_close(&denoise(&mut net, &rgb), &by_tensors(&net, &rgb), TOLERANCE);
             }
             let mosaic = rgb.index_axis(Axis(1), 0);
             for cfa in [CfaPattern::Rggb, CfaPattern::Bggr, CfaPattern::Grbg, CfaPattern::Gbrg] {
@@ -79,11 +82,11 @@ fn wide_networks_of_any_size_pass_and_both_paths_agree() {
         let video = pattern((3, 1, h, w));
         let spec = FfdnetSpec { channels: 1, width: 41, depth: 4, layout: FfdnetLayout::Direct };
         let mut ffdnet = Ffdnet::random(spec, 1).unwrap();
-        assert_close(&denoise(&mut ffdnet, &video), &by_tensors(&ffdnet, &video), 5e-5);
+        assert_close(&denoise(&mut ffdnet, &video), &by_tensors(&ffdnet, &video), TOLERANCE);
         for widths in [[32, 64, 128], [20, 36, 70], [16, 32, 64]] {
             let spec = FastdvdnetSpec { channels: 1, widths, batch_norm: true };
             let mut net = Fastdvdnet::random(spec, Ends::Circular, 2).unwrap();
-            assert_close(&denoise(&mut net, &video), &by_tensors(&net, &video), 5e-5);
+            assert_close(&denoise(&mut net, &video), &by_tensors(&net, &video), TOLERANCE);
         }
     }
 }
@@ -105,9 +108,9 @@ fn wide_networks_pass_on_every_instruction_set() {
 fn a_large_odd_frame_passes() {
     let video = pattern((1, 1, 255, 257));
     let mut ffdnet = tiny_ffdnet(1);
-    assert_close(&denoise(&mut ffdnet, &video), &by_tensors(&ffdnet, &video), 1e-5);
+    assert_close(&denoise(&mut ffdnet, &video), &by_tensors(&ffdnet, &video), TOLERANCE);
     let mut fastdvdnet = tiny_fastdvdnet(1, Ends::Circular);
-    assert_close(&denoise(&mut fastdvdnet, &video), &by_tensors(&fastdvdnet, &video), 1e-5);
+    assert_close(&denoise(&mut fastdvdnet, &video), &by_tensors(&fastdvdnet, &video), TOLERANCE);
     let mut rgb = Array4::from_elem((1, 3, 255, 257), f32::NAN);
     tiny_ddnet().demosaic(CfaPattern::Grbg, video.index_axis(Axis(1), 0), rgb.view_mut()).unwrap();
     assert!(rgb.iter().all(|v| v.is_finite()));

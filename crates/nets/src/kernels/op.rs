@@ -47,7 +47,7 @@ impl Default for Conv3x3 {
 pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
     let ours = |t: &Tensor| t.device().is_cpu() && t.dtype() == DType::F32;
     if ours(x) && ours(w) && bias.is_none_or(ours) {
-        return conv3x3_on(Isa::detect().map_err(Error::wrap)?, x, w, bias, opts);
+        return conv3x3_on(Isa::detect_for_gradients().map_err(Error::wrap)?, x, w, bias, opts);
     }
     let y = x.conv2d(w, 1, opts.stride, 1, opts.groups)?;
     let y = match bias {

@@ -57,8 +57,7 @@ impl Isa {
         }
     }
 
-    /// The one to use: `SCI_KERNEL` if it is set, else the fastest that this machine has but for [`Isa::Amx`], whose
-    /// greater error must be asked for. Read once per process.
+    /// The one to use: `SCI_KERNEL` if it is set, else the fastest that this machine has. Read once per process.
     ///
     /// # Errors
     /// [`KernelError::UnknownIsa`] or [`KernelError::MissingIsa`] when `SCI_KERNEL` asks for what there is not.
@@ -68,13 +67,21 @@ impl Isa {
             .get_or_init(|| match std::env::var("SCI_KERNEL") {
                 Ok(name) => Self::named(&name),
                 Err(std::env::VarError::NotPresent) => {
-                    Ok(Self::ALL.into_iter().find(|isa| *isa != Self::Amx && isa.available()).unwrap_or(Self::Portable))
+                    Ok(Self::ALL.into_iter().find(|isa| isa.available()).unwrap_or(Self::Portable))
                 }
                 Err(std::env::VarError::NotUnicode(name)) => {
                     Err(KernelError::UnknownIsa(name.to_string_lossy().into()))
                 }
             })
             .clone()
+    }
+
+    /// The one to use where gradients are computed: as [`Isa::detect`], but for the matrix unit, which gains nothing there.
+    ///
+    /// # Errors
+    /// As [`Isa::detect`].
+    pub(super) fn detect_for_gradients() -> Result<Self, KernelError> {
+        Self::detect().map(|isa| if isa == Self::Amx { Self::Avx512 } else { isa })
     }
 
     /// The instruction set of that name, if this machine has it.
