@@ -27,6 +27,8 @@ mod lanes;
 mod observer;
 mod prior;
 mod problem;
+#[cfg(test)]
+mod reference;
 mod schedule;
 mod solver;
 mod tv;

@@ -416,45 +416,12 @@ unsafe fn dual_lanes<L: Lanes>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::{Array2, Array4};
+    use crate::reference;
+    use ndarray::Array4;
     use sci_forward::VideoShape;
     use sci_forward::testing::{moving_square, uniform};
 
     const CX: DenoiseCx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
-
-    /// scikit-image's loop, in `f64`, by the definition.
-    fn reference(image: ArrayView2<'_, f32>, weight: f64, inner: usize) -> Array2<f64> {
-        let image = image.mapv(f64::from);
-        let (h, w) = image.dim();
-        let (mut p0, mut p1) = (Array2::<f64>::zeros((h, w)), Array2::<f64>::zeros((h, w)));
-        let mut out = image.clone();
-        let (mut first, mut previous) = (0.0, 0.0);
-        for step in 0..inner {
-            if step > 0 {
-                out = Array2::from_shape_fn((h, w), |(i, j)| {
-                    let up = if i > 0 { p0[[i - 1, j]] } else { 0.0 };
-                    let left = if j > 0 { p1[[i, j - 1]] } else { 0.0 };
-                    image[[i, j]] - p0[[i, j]] - p1[[i, j]] + up + left
-                });
-            }
-            let g0 =
-                Array2::from_shape_fn((h, w), |(i, j)| if i + 1 < h { out[[i + 1, j]] - out[[i, j]] } else { 0.0 });
-            let g1 =
-                Array2::from_shape_fn((h, w), |(i, j)| if j + 1 < w { out[[i, j + 1]] - out[[i, j]] } else { 0.0 });
-            let norm = (&g0 * &g0 + &g1 * &g1).mapv(f64::sqrt);
-            let energy = ((&out - &image).mapv(|d| d * d).sum() + weight * norm.sum()) / image.len() as f64;
-            let shrink = norm.mapv(|n| 1.0 / (1.0 + 0.25 / weight * n));
-            p0 = (p0 - 0.25 * g0) * &shrink;
-            p1 = (p1 - 0.25 * g1) * &shrink;
-            if step == 0 {
-                first = energy;
-            } else if (previous - energy).abs() < 2e-4 * first {
-                break;
-            }
-            previous = energy;
-        }
-        out
-    }
 
     #[test]
     fn the_fast_path_is_the_definition_at_every_size() {
@@ -466,7 +433,8 @@ mod tests {
                     let mut tv = Tv { sweep, ..Tv::new(weight).inner(inner) };
                     tv.denoise(&CX, noisy.view(), out.view_mut()).unwrap();
                     for t in 0..2 {
-                        let expected = reference(noisy.slice(ndarray::s![t, 0, .., ..]), f64::from(weight), inner);
+                        let frame = noisy.slice(ndarray::s![t, 0, .., ..]).mapv(f64::from);
+                        let expected = reference::tv(&frame, f64::from(weight), inner);
                         for ((i, j), e) in expected.indexed_iter() {
                             let ours = f64::from(out[[t, 0, i, j]]);
                             assert!(

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use admm::{BoxError, IterInfo, Observer, Plan, StopReason};
 use anyhow::Context;
-use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Axis};
+use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Axis, CowArray};
 use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
 use sci_forward::{SensingOperator, VideoShape};
 
@@ -328,13 +328,15 @@ fn write(
     let output = &experiment.output;
     let views: Vec<ArrayView4<'_, f32>> = solutions.iter().map(Solution::video).collect();
     let video = ndarray::concatenate(Axis(0), &views).context("joining the measurements")?;
+    // Pictures show white as white; the numbers are on the measurements' own scale.
+    let scaled = if scene.unit == 1.0 { CowArray::from(video.view()) } else { CowArray::from(&video * scene.unit) };
     let format = match output.format {
         OutputFormat::Npy => ArrayFormat::Npy,
         OutputFormat::Npz => ArrayFormat::Npz,
         OutputFormat::Mat => ArrayFormat::Mat,
     };
     let recon = dir.join(format!("recon.{}", format.extension()));
-    write_arrays(&recon, format, &[Part { name: "recon", data: video.view(), is_light: true }])?;
+    write_arrays(&recon, format, &[Part { name: "recon", data: scaled.view(), is_light: true }])?;
     if output.frames {
         let b = scene.frames();
         let name = |i: usize| format!("m{:02}_t{:02}.png", solutions[i / b].record.index, i % b);

@@ -10,6 +10,7 @@ use toml::Value as Toml;
 use super::adaptation::Online;
 use super::file::*;
 use super::source::{ConfigError, Source};
+use crate::io::defects::Defects;
 use crate::io::scene::{Axes, Keys, Reading};
 
 /// A path as written, with what is needed to look it up and to report it.
@@ -252,6 +253,7 @@ const TOP: [&str; 12] = [
 ];
 const PATTERNS: [(&str, CfaPattern); 4] =
     [("rggb", CfaPattern::Rggb), ("bggr", CfaPattern::Bggr), ("grbg", CfaPattern::Grbg), ("gbrg", CfaPattern::Gbrg)];
+const DEFECTS: [(&str, Defects); 2] = [("keep", Defects::Keep), ("exclude", Defects::Exclude)];
 pub(super) const MAX_ITERATIONS: i64 = 100_000;
 const SEEDS: RangeInclusive<i64> = 0..=i64::MAX;
 
@@ -337,6 +339,7 @@ impl<'s> Checker<'s> {
                 axes: self.choice("data.axes", &k.axes, &[("hwt", Axes::Hwt), ("thw", Axes::Thw)])?,
                 scale: self.number("data.scale", &k.scale, 1e-6..=1e6)?.map(|s| s as f32),
                 cfa: self.choice("data.cfa", &k.cfa, &PATTERNS)?,
+                defects: self.choice("data.defects", &k.defects, &DEFECTS)?.unwrap_or_default(),
             },
             simulate,
         })

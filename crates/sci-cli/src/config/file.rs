@@ -34,6 +34,7 @@ pub struct DataKeys {
     pub axes: Value,
     pub scale: Value,
     pub cfa: Value,
+    pub defects: Value,
 }
 
 /// `[data.keys]`: the names of a scene's parts in its file.

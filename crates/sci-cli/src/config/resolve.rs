@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 
 use super::check::{self, Checked, Mask, Momentum, PathSetting};
 use super::source::{ConfigError, Place, Source};
+use crate::io::defects::Defects;
 use crate::io::scene::{Axes, Reading};
 
 pub use super::adaptation::Online;
@@ -344,6 +345,7 @@ impl Experiment {
             "axes": axes,
             "scale": d.reading.scale,
             "cfa": d.reading.cfa.map(|c| c.to_string().to_lowercase()),
+            "defects": if d.reading.defects == Defects::Exclude { "exclude" } else { "keep" },
         });
         if let Some(s) = &d.simulate {
             let random = |kind, r: &RandomMask| json!({ "kind": kind, "frames": r.frames, "density": r.density, "seed": r.seed });

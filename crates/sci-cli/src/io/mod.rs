@@ -4,6 +4,7 @@
 //! its [`Budget`](samples::Budget) of four times the file's size plus 64 MiB. Formats are told apart by
 //! content, not by the file's name.
 
+pub mod defects;
 pub mod frames;
 pub mod mat;
 pub mod npy;

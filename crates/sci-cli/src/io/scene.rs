@@ -11,6 +11,7 @@ use ndarray::{Array3, Array4, ArrayD, ArrayView2, ArrayView3, ArrayView4, Axis, 
 use sci_forward::bayer::mosaic_into;
 use sci_forward::{CfaPattern, MaskError, MaskOperator, MaskStack, SensingOperator};
 
+use super::defects::{self, Defects};
 use super::samples::{Array, SampleType, Samples};
 use super::{FileError, Format, NamedArrays, ReadError, frames, mat, npy, read_file};
 
@@ -59,6 +60,8 @@ pub struct Reading {
     pub scale: Option<f32>,
     /// The Bayer pattern of the sensor: RGGB where there is RGB truth, none (a gray sensor) otherwise.
     pub cfa: Option<CfaPattern>,
+    /// What to do about defective pixels of the sensor.
+    pub defects: Defects,
 }
 
 /// Why files do not make a scene.
@@ -117,7 +120,9 @@ pub enum SceneError {
         mask_size: (usize, usize),
     },
     /// NaN or infinity.
-    #[error("{file}: `{key}` is {value} at frame {frame}, row {row}, column {column}; every value must be finite")]
+    #[error(
+        "{file}: `{key}` is {value} at frame {frame}, row {row}, column {column}; every value must be finite (data.defects = \"exclude\" leaves such pixels of a measurement out)"
+    )]
     NotFinite {
         /// The file.
         file: String,
@@ -184,6 +189,9 @@ pub struct Scene {
     pub rgb: Option<Array4<f32>>,
     /// The pattern of a color sensor, `None` for a gray one.
     pub cfa: Option<CfaPattern>,
+    /// What white is in units of the file's scale. 1 but for measurements that are far off that scale: they, and truth that is too,
+    /// are divided by it, so that results have to be multiplied.
+    pub unit: f32,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
 }
@@ -256,7 +264,7 @@ impl Scene {
                 });
             }
         };
-        let mut scene = Self { operator, measurements, truth, rgb, cfa, warnings };
+        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, warnings };
         scene.look_for_wrong_scales();
         Ok(scene)
     }
@@ -393,13 +401,13 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
         arrays.remove(key).map(|a| to_frames(&file, key, a, format, reading.axes, scale)).transpose()
     };
     let mask = part(&keys.mask, Some(1.0))?;
-    let meas = part(&keys.meas, reading.scale)?;
+    let mut meas = part(&keys.meas, reading.scale)?;
     let orig = part(&keys.orig, reading.scale)?;
     let missing =
         |key: &str, part| SceneError::MissingKey { file: file.clone(), key: key.into(), part, present: names.clone() };
-    let mask = mask.ok_or_else(|| missing(&keys.mask, "the masks"))?;
+    let mut mask = normalise_mask(mask.ok_or_else(|| missing(&keys.mask, "the masks"))?);
     let rgb = arrays.remove(&keys.rgb).map(|a| to_channels(&file, &keys.rgb, a, format, reading)).transpose()?;
-    let truth = match rgb {
+    let mut truth = match rgb {
         Some(rgb) if rgb.len_of(Axis(1)) == 3 => Some(Truth::Rgb(rgb)),
         Some(gray) => return Err(not_color(&file, &keys.rgb, gray.shape())),
         None => orig.map(Truth::Sensor),
@@ -407,7 +415,64 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     if meas.is_none() && truth.is_none() {
         return Err(missing(&keys.meas, "measurements, or `orig` or `rgb` to simulate them from"));
     }
-    Scene::new(&file, keys, normalise_mask(mask), meas, truth, reading.cfa)
+    let (mut unit, mut warnings) = (1.0, Vec::new());
+    if let Some(meas) = meas.as_mut().filter(|m| m.shape()[1..] == mask.shape()[1..]) {
+        if reading.scale.is_none() {
+            unit = rescale(&mask, meas, truth.as_mut(), &mut warnings);
+        }
+        let color = reading.cfa.is_some() || matches!(truth, Some(Truth::Rgb(_)));
+        let defects = defects::find(mask.sum_axis(Axis(0)).view(), meas.view(), if color { 2 } else { 1 });
+        if let Some(named) = defects::named(&defects) {
+            warnings.push(match reading.defects {
+                Defects::Exclude => format!("pixels left out as not measured: {named}"),
+                Defects::Keep => format!("pixels look defective: {named}; data.defects = \"exclude\" leaves them out"),
+            });
+        }
+        if reading.defects == Defects::Exclude {
+            defects::exclude(&defects, &mut mask, meas);
+        }
+    }
+    let mut scene = Scene::new(&file, keys, mask, meas, truth, reading.cfa)?;
+    scene.unit = unit;
+    warnings.append(&mut scene.warnings);
+    scene.warnings = warnings;
+    Ok(scene)
+}
+
+/// White is here, in units of the file's scale; a scene may be darker than white, but a sensor's 8 bits end at the lower one.
+const PLAUSIBLE_WHITE: std::ops::RangeInclusive<f32> = 1.0 / 64.0..=4.0;
+
+/// Brings measurements that are far off their scale, and truth that is too, to one on which the brightest hundredth is white; returns
+/// what white was.
+fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>, warnings: &mut Vec<String>) -> f32 {
+    let open = mask.sum_axis(Axis(0));
+    let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
+    let Some(white) = brightest_hundredth(light) else { return 1.0 };
+    if white <= 0.0 || PLAUSIBLE_WHITE.contains(&white) {
+        return 1.0;
+    }
+    *meas /= white;
+    let values = match truth {
+        None => None,
+        Some(Truth::Sensor(x)) => Some(x.view_mut().into_dyn()),
+        Some(Truth::Rgb(x)) => Some(x.view_mut().into_dyn()),
+    };
+    if let Some(mut x) = values {
+        if brightest_hundredth(x.iter().copied()).is_some_and(|v| v > 0.0 && !PLAUSIBLE_WHITE.contains(&v)) {
+            x /= white;
+        }
+    }
+    warnings.push(format!(
+        "measurements are off their scale: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
+    ));
+    white
+}
+
+/// The value that a hundredth of the finite ones exceed.
+fn brightest_hundredth(values: impl Iterator<Item = f32>) -> Option<f32> {
+    let mut finite: Vec<f32> = values.filter(|v| v.is_finite()).collect();
+    let rank = finite.len().checked_sub(1)? * 99 / 100;
+    Some(*finite.select_nth_unstable_by(rank, f32::total_cmp).1)
 }
 
 fn not_color(file: &str, key: &str, shape: &[usize]) -> SceneError {
@@ -679,9 +744,31 @@ mod tests {
     #[test]
     fn a_measurement_of_another_scale_is_noticed() {
         let dir = tempfile::tempdir().unwrap();
-        let meas = column_major((2, 3, 4), |_, _, _| 255.0 * 255.0);
+        let meas = column_major((2, 3, 4), |_, _, _| 3.0 * 255.0);
         let scene = read(&write_scene(dir.path(), Some(meas)), &Reading::default()).unwrap();
-        assert_eq!(scene.warnings.len(), 2, "{:?}", scene.warnings);
+        assert_eq!((scene.warnings.len(), scene.unit), (2, 1.0), "{:?}", scene.warnings);
+    }
+
+    #[test]
+    fn a_measurement_far_off_its_scale_is_rescaled_unless_the_scale_is_given() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = write_scene(dir.path(), Some(column_major((2, 3, 4), |_, _, _| 1e8 * 255.0)));
+        let scene = read(&path, &Reading::default()).unwrap();
+        assert_eq!((scene.unit, scene.measurement(1)[[1, 2]]), (1e8, 1.0));
+        assert!(scene.warnings[0].contains("white is taken to be 1e8"), "{:?}", scene.warnings);
+        let scene = read(&path, &Reading { scale: Some(255.0), ..Reading::default() }).unwrap();
+        assert_eq!((scene.unit, scene.measurement(1)[[1, 2]]), (1.0, 1e8));
+    }
+
+    #[test]
+    fn a_nan_pixel_is_left_out_on_request() {
+        let dir = tempfile::tempdir().unwrap();
+        let meas = column_major((2, 3, 4), |t, y, x| if (t, y, x) == (1, 2, 0) { f32::NAN } else { 200.0 });
+        let reading = Reading { defects: Defects::Exclude, ..Reading::default() };
+        let scene = read(&write_scene(dir.path(), Some(meas)), &reading).unwrap();
+        assert_eq!(scene.operator.masks().sum()[[2, 0]], 0.0);
+        assert!(scene.measurements.iter().all(|v| v.is_finite()));
+        assert!(scene.warnings[0].contains("1 not finite at (row, column) (2, 0)"), "{:?}", scene.warnings);
     }
 
     #[test]
