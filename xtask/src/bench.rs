@@ -7,7 +7,7 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 
-use crate::workspace::{built_sci, cargo, json_lines, output, root};
+use crate::workspace::{built_sci, cargo, cpu, json_lines, median, output, range, results_dir, revision, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -29,18 +29,12 @@ pub(crate) struct Options {
 }
 
 impl Options {
-    fn shared(&self) -> anyhow::Result<PathBuf> {
-        let named = self.shared.clone().or_else(|| std::env::var_os("SCI_DATA").map(PathBuf::from));
-        let dir = named.unwrap_or_else(|| root().join("../shared"));
-        dir.canonicalize().with_context(|| format!("{}: give --shared DIR", dir.display()))
-    }
-
     fn peer_script(&self) -> anyhow::Result<Option<(&Path, PathBuf)>> {
         let Some(python) = &self.peer else {
             println!("no Python given (--peer PYTHON): measuring our side only");
             return Ok(None);
         };
-        let script = self.shared()?.join("peers/peer.py");
+        let script = shared(self.shared.as_deref())?.join("peers/peer.py");
         ensure!(script.is_file(), "{} is missing", script.display());
         Ok(Some((python, script)))
     }
@@ -81,7 +75,7 @@ impl Side {
 
 /// `configs/gray/<name>.toml` against `peer.py <name>` on measurement 0.
 pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
-    let shared = options.shared()?;
+    let shared = shared(options.shared.as_deref())?;
     let scene = shared.join("data").join(&options.scene);
     ensure!(scene.is_file(), "{} is missing", scene.display());
     let weights = (name == "gap-ffdnet").then(|| shared.join("weights/ffdnet_gray_ipol.pth"));
@@ -184,41 +178,11 @@ fn save(name: &str, mut result: Value, options: &Options) -> anyhow::Result<()> 
     if !options.save {
         return Ok(());
     }
-    let cpu = cpu();
-    result["cpu"] = json!(cpu);
-    result["revision"] = json!(output(Command::new("git").current_dir(root()).args(["rev-parse", "HEAD"]))?.trim());
-    let folder: String =
-        cpu.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' }).collect();
-    let dir = root().join("xtask/results").join(folder);
-    fs::create_dir_all(&dir)?;
+    result["cpu"] = json!(cpu());
+    result["revision"] = json!(revision()?);
+    let dir = results_dir()?;
     let path = dir.join(format!("{name}.json"));
     fs::write(&path, serde_json::to_string_pretty(&result)? + "\n")?;
     println!("wrote {}", path.display());
     Ok(())
-}
-
-fn cpu() -> String {
-    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = info.lines().find(|l| l.starts_with("model name")).and_then(|l| l.split_once(':'));
-    name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
-}
-
-fn range(values: &[f64]) -> (f64, f64) {
-    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)))
-}
-
-fn median(values: &[f64]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let middle = sorted.len() / 2;
-    if sorted.len() % 2 == 1 { sorted[middle] } else { (sorted[middle - 1] + sorted[middle]) / 2.0 }
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn medians() {
-        assert_eq!(super::median(&[3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(super::median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
-    }
 }

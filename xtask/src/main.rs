@@ -3,6 +3,10 @@
 //! They drive the built `sci` and read its run records; nothing here links the solvers.
 
 mod bench;
+mod pareto;
+mod plot;
+mod repro;
+mod stress;
 mod tidy;
 mod workspace;
 
@@ -16,6 +20,12 @@ enum Task {
     /// Measure speed, and compare with the Python a user would run instead
     #[command(subcommand)]
     Bench(Bench),
+    /// The paper's tables, cell by cell, beside what this program gives
+    Repro(repro::Options),
+    /// Feed every solver what no one should feed it, and print how each case ended
+    Stress(stress::Options),
+    /// Read a million damaged files and experiments
+    Fuzz,
 }
 
 #[derive(Subcommand)]
@@ -26,13 +36,19 @@ enum Bench {
     GapFfdnet(bench::Options),
     /// 3×3 convolutions
     Kernels(bench::Options),
+    /// Run time against error: every solver × denoiser over a range of budgets
+    Pareto(pareto::Options),
 }
 
 fn main() -> anyhow::Result<()> {
     match Task::parse() {
         Task::Tidy => tidy::run(),
+        Task::Repro(options) => repro::run(&options),
+        Task::Stress(options) => stress::run(&options),
+        Task::Fuzz => stress::fuzz(),
         Task::Bench(Bench::GapTv(options)) => bench::solver("gap-tv", &options),
         Task::Bench(Bench::GapFfdnet(options)) => bench::solver("gap-ffdnet", &options),
         Task::Bench(Bench::Kernels(options)) => bench::kernels(&options),
+        Task::Bench(Bench::Pareto(options)) => pareto::run(&options),
     }
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
+use serde_json::Value;
 
 /// The root of the repository.
 pub(crate) fn root() -> &'static Path {
@@ -35,6 +36,77 @@ pub(crate) fn built_sci() -> anyhow::Result<PathBuf> {
 }
 
 /// The lines that are JSON objects.
-pub(crate) fn json_lines(text: &str) -> impl Iterator<Item = serde_json::Value> {
-    text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok()).filter(|v| v.is_object())
+pub(crate) fn json_lines(text: &str) -> impl Iterator<Item = Value> {
+    text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()).filter(|v| v.is_object())
+}
+
+/// The folder with data/, weights/ and peers/: as named, else `SCI_DATA`, else beside the repository.
+pub(crate) fn shared(named: Option<&Path>) -> anyhow::Result<PathBuf> {
+    let named = named.map(PathBuf::from).or_else(|| std::env::var_os("SCI_DATA").map(PathBuf::from));
+    let dir = named.unwrap_or_else(|| root().join("../shared"));
+    dir.canonicalize().with_context(|| format!("{}: give --shared DIR", dir.display()))
+}
+
+/// Where results of this machine are kept, created if it is not there.
+pub(crate) fn results_dir() -> anyhow::Result<PathBuf> {
+    let folder: String =
+        cpu().chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' }).collect();
+    let dir = root().join("xtask/results").join(folder);
+    std::fs::create_dir_all(&dir).with_context(|| dir.display().to_string())?;
+    Ok(dir)
+}
+
+/// The commit that is checked out.
+pub(crate) fn revision() -> anyhow::Result<String> {
+    Ok(output(Command::new("git").current_dir(root()).args(["rev-parse", "HEAD"]))?.trim().to_owned())
+}
+
+/// The processor's name.
+pub(crate) fn cpu() -> String {
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = info.lines().find(|l| l.starts_with("model name")).and_then(|l| l.split_once(':'));
+    name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}
+
+/// How a run of `sci` ended: exit code, what it said on standard error, and its record if it left one.
+pub(crate) struct Finished {
+    pub(crate) code: Option<i32>,
+    pub(crate) stderr: String,
+    pub(crate) record: Option<Value>,
+}
+
+/// `sci run CONFIG --set ...` into `out`.
+pub(crate) fn sci_run(sci: &Path, config: &Path, sets: &[String], out: &Path) -> anyhow::Result<Finished> {
+    let mut command = Command::new(sci);
+    command.arg("run").arg(config).arg("--out").arg(out);
+    sets.iter().for_each(|set| {
+        command.arg("--set").arg(set);
+    });
+    let output = command.output().with_context(|| format!("{command:?}"))?;
+    let record = std::fs::read_to_string(out.join("record.json")).ok();
+    Ok(Finished {
+        code: output.status.code(),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+        record: record.map(|r| serde_json::from_str(&r)).transpose()?,
+    })
+}
+
+pub(crate) fn range(values: &[f64]) -> (f64, f64) {
+    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)))
+}
+
+pub(crate) fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let middle = sorted.len() / 2;
+    if sorted.len() % 2 == 1 { sorted[middle] } else { (sorted[middle - 1] + sorted[middle]) / 2.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn medians() {
+        assert_eq!(super::median(&[3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(super::median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
+    }
 }
