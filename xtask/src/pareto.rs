@@ -33,7 +33,7 @@ pub(crate) struct Options {
     /// Every curve once more with this setting, as in --variant skip.enabled=true
     #[arg(long, value_name = "KEY=VALUE")]
     variant: Option<String>,
-    /// Rounds; each runs everything once, so that what is compared alternates
+    /// Rounds; each runs everything once, so that what is compared alternates; 0 only draws what is kept
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=100))]
     runs: u32,
     /// Add to the results kept in xtask/results/<cpu>/, and draw the plots from all of them
@@ -246,9 +246,9 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let suite = options.suite;
     let kept = results_dir()?.join(format!("pareto-{}.json", suite.name()));
     let mut results = if options.save && kept.is_file() { Results::read(&kept)? } else { Results::default() };
-    let sci = built_sci()?;
-    for _ in 0..options.runs {
-        round(options, &sci, &mut results)?;
+    if options.runs > 0 {
+        let sci = built_sci()?;
+        (0..options.runs).try_for_each(|_| round(options, &sci, &mut results))?;
     }
     ensure!(!results.points.is_empty(), "nothing was measured");
     (results.suite, results.cpu, results.revision) = (suite.name().into(), cpu(), revision()?);
