@@ -30,36 +30,43 @@ pub fn is_y4m(bytes: &[u8]) -> bool {
 /// [`ReadError`] for broken bytes or more pixels than the file's budget.
 pub fn read_gif(bytes: &[u8]) -> Result<Array, ReadError> {
     let broken = |e: image::ImageError| ReadError::Malformed { format: GIF, reason: e.to_string() };
+    let open = || -> Result<(image::Frames<'_>, usize, usize), ReadError> {
+        let mut decoder = GifDecoder::new(Cursor::new(bytes)).map_err(broken)?;
+        let (w, h) = decoder.dimensions();
+        let mut limits = Limits::default();
+        limits.max_alloc = Some(Budget::for_file(bytes.len()).left() as u64);
+        decoder.set_limits(limits).map_err(broken)?;
+        Ok((decoder.into_frames(), w as usize, h as usize))
+    };
     let mut budget = Budget::for_file(bytes.len());
-    let mut decoder = GifDecoder::new(Cursor::new(bytes)).map_err(broken)?;
-    let (w, h) = decoder.dimensions();
-    let pixels = w as usize * h as usize;
-    // The decoder keeps one canvas, and hands out one frame at a time, both RGBA.
-    budget.claim(pixels, 8)?;
-    let mut limits = Limits::default();
-    limits.max_alloc = Some(Budget::for_file(bytes.len()).left() as u64);
-    decoder.set_limits(limits).map_err(broken)?;
-    let mut planes = Vec::new();
+    // The frames are counted first: a vector that grows would hold its content twice.
+    let (counted, w, h) = open()?;
+    // The decoder keeps a canvas, the part of it that changes and the new one, and hands that out, all RGBA.
+    budget.claim(w * h, 16)?;
     let mut frames = 0;
-    for frame in decoder.into_frames() {
-        let rgba = frame.map_err(broken)?.into_buffer().into_raw();
-        budget.claim(pixels, 3)?;
-        push_planes(&mut planes, &rgba, 4);
+    for frame in counted {
+        frame.map_err(broken)?;
+        budget.claim(w * h, 3)?;
         frames += 1;
+    }
+    let mut planes = Vec::with_capacity(frames * w * h * 3);
+    for frame in open()?.0 {
+        push_planes(&mut planes, &frame.map_err(broken)?.into_buffer().into_raw(), 4);
     }
     if frames == 0 {
         return Err(ReadError::Malformed { format: GIF, reason: "no frames".into() });
     }
-    drop_equal_channels(planes, frames, h as usize, w as usize)
+    drop_equal_channels(planes, frames, h, w)
 }
 
 /// Keeps one channel of a video `[T, 3, H, W]` whose channels are all equal.
-fn drop_equal_channels(planes: Vec<u8>, t: usize, h: usize, w: usize) -> Result<Array, ReadError> {
+fn drop_equal_channels(mut planes: Vec<u8>, t: usize, h: usize, w: usize) -> Result<Array, ReadError> {
     let n = h * w;
     let gray = n > 0 && planes.chunks_exact(3 * n).all(|f| f[..n] == f[n..2 * n] && f[..n] == f[2 * n..]);
     if gray {
-        let v: Vec<u8> = planes.chunks_exact(3 * n).flat_map(|f| f[..n].iter().copied()).collect();
-        Array::new(vec![t, 1, h, w], Samples::Bytes(v), SampleType::U8)
+        (0..t).for_each(|f| planes.copy_within(3 * n * f..3 * n * f + n, n * f));
+        planes.truncate(t * n);
+        Array::new(vec![t, 1, h, w], Samples::Bytes(planes), SampleType::U8)
     } else {
         Array::new(vec![t, 3, h, w], Samples::Bytes(planes), SampleType::U8)
     }
