@@ -457,10 +457,9 @@ fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>
         Some(Truth::Sensor(x)) => Some(x.view_mut().into_dyn()),
         Some(Truth::Rgb(x)) => Some(x.view_mut().into_dyn()),
     };
-    if let Some(mut x) = values {
-        if brightest_hundredth(x.iter().copied()).is_some_and(|v| v > 0.0 && !PLAUSIBLE_WHITE.contains(&v)) {
-            x /= white;
-        }
+    let is_off = |v: f32| v > 0.0 && !PLAUSIBLE_WHITE.contains(&v);
+    if let Some(mut x) = values.filter(|x| brightest_hundredth(x.iter().copied()).is_some_and(is_off)) {
+        x /= white;
     }
     warnings.push(format!(
         "measurements are off their scale: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
