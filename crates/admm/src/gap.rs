@@ -29,12 +29,13 @@ pub enum MomentumStart {
 pub struct Gap<D> {
     denoiser: D,
     momentum: Option<MomentumStart>,
+    restarts: bool,
 }
 
 impl<D: Denoiser> Gap<D> {
     /// Plain GAP.
     pub fn plain(denoiser: D) -> Self {
-        Self { denoiser, momentum: None }
+        Self { denoiser, momentum: None, restarts: false }
     }
 
     /// Accelerated GAP with `y1` starting at `y`.
@@ -44,7 +45,15 @@ impl<D: Denoiser> Gap<D> {
 
     /// Accelerated GAP with a chosen start of `y1`.
     pub fn with_momentum(denoiser: D, start: MomentumStart) -> Self {
-        Self { denoiser, momentum: Some(start) }
+        Self { denoiser, momentum: Some(start), restarts: false }
+    }
+
+    /// Lets y1 start anew, at y, with every stage.
+    ///
+    /// y1 makes up for what the denoiser takes away. A stage with a smaller σ takes less, so that its first iteration
+    /// overshoots by far (3 dB) without this.
+    pub fn restarting(self) -> Self {
+        Self { restarts: true, ..self }
     }
 }
 
@@ -59,15 +68,25 @@ pub struct GapState {
     previous: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
     y1: Option<Array2<f32>>,
+    /// The stage of the last step.
+    stage: usize,
 }
 
 impl GapState {
     /// The x of the next iteration from the v of this one. It reads v once for the projection and for how far v has come.
     fn project(&mut self, problem: &Problem<'_>) -> Progress {
-        let Self { x, v, previous, y1 } = self;
+        let Self { x, v, previous, y1, .. } = self;
         let previous = Some(previous.view());
         let step = DataStep { momentum: y1.as_mut(), previous, ..DataStep::projection(problem.y()) };
         problem.operator().data_step(step, v.view(), x.view_mut())
+    }
+
+    /// Forgets what y1 has accumulated: x is again the projection of v onto the measurement.
+    fn restart(&mut self, problem: &Problem<'_>) {
+        if let Some(y1) = &mut self.y1 {
+            y1.assign(&problem.y());
+            problem.operator().data_step(DataStep::projection(problem.y()), self.v.view(), self.x.view_mut());
+        }
     }
 }
 
@@ -84,12 +103,15 @@ impl<D: Denoiser> Solver for Gap<D> {
             MomentumStart::Measurement => problem.y().to_owned(),
         });
         let zeros = Array3::zeros(start.dim());
-        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1 };
+        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1, stage: 0 };
         state.project(problem);
         state
     }
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<Progress, BoxError> {
+        if std::mem::replace(&mut state.stage, cx.stage) != cx.stage && self.restarts {
+            state.restart(problem);
+        }
         let GapState { x, v, previous, .. } = state;
         std::mem::swap(previous, v);
         self.denoiser.denoise(cx, x.view().insert_axis(Axis(1)), v.view_mut().insert_axis(Axis(1)))?;

@@ -21,6 +21,8 @@ pub struct IterInfo<'a> {
     pub relative_residual: f64,
     /// `‖x_k − x_{k−1}‖ / ‖x_k‖` of the estimate.
     pub relative_change: f64,
+    /// The mean square error that the held-out pixels predict, if there are any ([`HoldOut`](crate::HoldOut)).
+    pub predicted_error: Option<f64>,
     /// Seconds of solving so far, observers not counted.
     pub seconds: f64,
 }

@@ -31,6 +31,11 @@ impl<'a> Problem<'a> {
         Ok(Self { operator, y, scale })
     }
 
+    /// The same problem for a shorter time, which views are not by themselves.
+    pub(crate) fn reborrow(&self) -> Problem<'_> {
+        Problem { y: self.y.reborrow(), ..*self }
+    }
+
     /// `H`.
     pub fn operator(&self) -> &'a dyn SensingOperator {
         self.operator

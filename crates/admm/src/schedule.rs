@@ -1,5 +1,6 @@
 //! What a run does and when it ends: stages of σ, and the stop rule.
 
+use crate::HoldOut;
 use std::time::Duration;
 
 /// A number of iterations at one σ.
@@ -36,12 +37,14 @@ pub struct Plan {
     pub stages: Vec<Stage>,
     /// The stop rule.
     pub stop: StopRule,
+    /// Whether stages are cut short, judged by held-out pixels; off if nothing. The numbers of iterations are then limits.
+    pub hold_out: Option<HoldOut>,
 }
 
 impl Plan {
     /// These stages, stopped only by divergence.
     pub fn new(stages: impl Into<Vec<Stage>>) -> Self {
-        Self { stages: stages.into(), stop: StopRule::default() }
+        Self { stages: stages.into(), stop: StopRule::default(), hold_out: None }
     }
 
     /// The iterations of all stages.

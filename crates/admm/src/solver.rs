@@ -1,6 +1,7 @@
 //! The one loop that drives every solver.
 
 use crate::guard::Guard;
+use crate::held_out::{HeldOut, Judge, Verdict};
 use crate::{BoxError, DenoiseCx, IterInfo, Observer, Plan, Problem, Start};
 use ndarray::{Array3, Array4, ArrayView3, ArrayView4};
 use sci_forward::Progress;
@@ -58,6 +59,8 @@ pub enum StopReason {
     ScheduleDone,
     /// The relative change fell to the tolerance.
     Converged,
+    /// Two stages in a row did nothing for the held-out pixels ([`HoldOut`](crate::HoldOut)).
+    Stalled,
     /// A value was not finite, the residual exploded, or what came out cannot be a scene: it explains the measurement worse than
     /// a black video, or is far brighter than it. The outcome holds the iterate that explains the measurement best.
     Diverged,
@@ -101,7 +104,8 @@ pub trait Solver {
 pub struct Outcome<S> {
     /// The last state of the solver (after a divergence, the diverged one).
     pub state: S,
-    /// The estimate `[T, H, W]`, always finite: after a divergence the one that explains the measurement best.
+    /// The estimate `[T, H, W]`, always finite: with held-out pixels the best one, else after a divergence the one that
+    /// explains the measurement best.
     pub estimate: Array3<f32>,
     /// The RGB estimate `[T, 3, H, W]` of a color solver that belongs to `estimate`; nothing after a divergence.
     pub rgb: Option<Array4<f32>>,
@@ -127,11 +131,16 @@ pub fn run<S: Solver>(
     observer: &mut dyn Observer,
 ) -> Result<Outcome<S::State>, SolveError> {
     let mut clock = Stopwatch::start();
-    let start = start.video(problem)?;
-    let mut relative_residual =
-        relative(problem.operator().progress(problem.y(), start.view(), start.view()), problem).0;
-    let mut guard = Guard::new(problem, relative_residual, plan.stop.diverged_above);
-    let mut state = solver.init(problem, start);
+    let held_out = plan.hold_out.as_ref().and_then(|config| HeldOut::new(problem.reborrow(), config));
+    let given = match &held_out {
+        Some(pixels) => pixels.problem()?,
+        None => problem.reborrow(),
+    };
+    let start = start.video(&given)?;
+    let mut judge = held_out.as_ref().zip(plan.hold_out).map(|(pixels, config)| Judge::new(pixels, config, start.view()));
+    let mut relative_residual = relative(given.operator().progress(given.y(), start.view(), start.view()), &given).0;
+    let mut guard = Guard::new(&given, relative_residual, plan.stop.diverged_above);
+    let mut state = solver.init(&given, start);
     clock.pause();
     observer.begin(plan).map_err(|source| SolveError::Observer { iteration: 0, source })?;
 
@@ -139,11 +148,14 @@ pub fn run<S: Solver>(
     let mut stop = StopReason::ScheduleDone;
     let mut last = Progress::default();
     'stages: for (stage, &crate::Stage { sigma, iterations: count }) in plan.stages.iter().enumerate() {
-        for _ in 0..count {
+        if stage + 1 < plan.stages.len() && judge.as_ref().is_some_and(|judge| judge.skips(sigma)) {
+            continue;
+        }
+        for left in (0..count).rev() {
             clock.resume();
             let iteration = iterations;
             let cx = DenoiseCx { sigma, iteration, stage };
-            let progress = solver.step(problem, &cx, &mut state).map_err(|source| {
+            let progress = solver.step(&given, &cx, &mut state).map_err(|source| {
                 let name = solver.denoiser_name().to_owned();
                 SolveError::Denoiser { name, iteration, source }
             })?;
@@ -151,24 +163,48 @@ pub fn run<S: Solver>(
             let estimate = solver.estimate(&state);
             let rgb = solver.rgb(&state);
             let rgb_is_finite = rgb.is_none_or(|rgb| rgb.iter().all(|v| v.is_finite()));
-            clock.pause();
-
-            let (residual, relative_change) = relative(progress, problem);
+            let (residual, relative_change) = relative(progress, &given);
             if !rgb_is_finite || !guard.admit(residual, relative_change, solver.previous(&state)) {
                 stop = StopReason::Diverged;
                 break 'stages;
             }
             (relative_residual, last) = (residual, progress);
+            let judged = judge.as_mut().map(|judge| judge.judge(estimate, rgb, left == 0));
+            clock.pause();
+
+            let (predicted_error, verdict) = judged.unzip();
             let seconds = clock.elapsed().as_secs_f64();
-            let info = IterInfo { iteration, stage, sigma, estimate, rgb, relative_residual, relative_change, seconds };
+            let info = IterInfo {
+                iteration,
+                stage,
+                sigma,
+                estimate,
+                rgb,
+                relative_residual,
+                relative_change,
+                predicted_error,
+                seconds,
+            };
             stop = match observer.iteration(&info).map_err(|source| SolveError::Observer { iteration, source })? {
                 ControlFlow::Break(()) => StopReason::Observer,
+                _ if verdict == Some(Verdict::Stop) => StopReason::Stalled,
                 _ if relative_change < plan.stop.relative_change => StopReason::Converged,
                 _ if plan.stop.time.is_some_and(|limit| clock.elapsed() >= limit) => StopReason::TimeUp,
+                _ if verdict == Some(Verdict::EndStage) => break,
                 _ => continue,
             };
             break 'stages;
         }
+    }
+    clock.resume();
+    if let Some(best) = judge.and_then(Judge::into_best) {
+        let progress = problem.operator().progress(problem.y(), best.estimate.view(), best.estimate.view());
+        relative_residual = relative(progress, problem).0;
+        if !guard.is_result(relative_residual, progress) {
+            stop = StopReason::Diverged;
+        }
+        let (estimate, rgb, seconds) = (best.estimate, best.rgb, clock.elapsed().as_secs_f64());
+        return Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual });
     }
     let (estimate, rgb) = match stop {
         StopReason::Diverged => {

@@ -103,6 +103,8 @@ pub enum Stop {
     ScheduleDone,
     /// The relative change fell to the tolerance.
     Converged,
+    /// The held-out pixels gained nothing any more; the result is the best iterate.
+    Stalled,
     /// A value was not finite or the residual exploded; the result is the estimate before.
     Diverged,
     /// The time limit passed.
@@ -116,6 +118,7 @@ impl From<admm::StopReason> for Stop {
         match reason {
             admm::StopReason::ScheduleDone => Self::ScheduleDone,
             admm::StopReason::Converged => Self::Converged,
+            admm::StopReason::Stalled => Self::Stalled,
             admm::StopReason::Diverged => Self::Diverged,
             admm::StopReason::TimeUp => Self::TimeUp,
             admm::StopReason::Observer => Self::Observer,

@@ -32,7 +32,7 @@ mod operator;
 pub mod testing;
 
 pub use bayer::{CfaPattern, Demosaicer};
-pub use mask::{MaskError, MaskStack};
+pub use mask::{MaskError, MaskStack, held_in};
 pub use noise::{Noise, NoiseError};
 pub use operator::{DataStep, MaskOperator, Progress, SensingOperator};
 

@@ -148,6 +148,21 @@ impl MaskStack {
     }
 }
 
+/// Which pixels of a sensor `[H, W]` stay in use when one in each `spacing` × `spacing` block, drawn with `seed`, is held
+/// out for validation: true for those that stay. With a spacing of 1 none would stay: it must be at least 2.
+///
+/// # Panics
+/// If `spacing` is less than 2.
+pub fn held_in(image: (usize, usize), spacing: usize, seed: u64) -> Array2<bool> {
+    assert!(spacing >= 2, "a spacing of {spacing} leaves no pixel: it must be at least 2");
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut stays = Array2::from_elem(image, true);
+    for mut block in stays.exact_chunks_mut((spacing, spacing)) {
+        block[[rng.random_range(0..spacing), rng.random_range(0..spacing)]] = false;
+    }
+    stays
+}
+
 fn bernoulli(dim: (usize, usize, usize), density: f64, seed: u64) -> Result<Array3<f32>, MaskError> {
     if !(density > 0.0 && density <= 1.0) {
         return Err(MaskError::Density(density));
@@ -191,6 +206,15 @@ mod tests {
         masks[[1, 2, 3]] = f32::NAN;
         check(masks, "NaN at frame 1, row 2, column 3");
         assert_eq!(MaskStack::random(SHAPE, 1.5, 0), Err(MaskError::Density(1.5)));
+    }
+
+    #[test]
+    fn one_pixel_of_each_block_is_held_out() {
+        let stays = held_in((31, 17), 5, 3);
+        assert_eq!(stays.iter().filter(|stays| !**stays).count(), 6 * 3);
+        assert!(stays.exact_chunks((5, 5)).into_iter().all(|block| block.iter().filter(|stays| !**stays).count() == 1));
+        assert_eq!(stays, held_in((31, 17), 5, 3));
+        assert_ne!(stays, held_in((31, 17), 5, 4));
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! is in cache. Sums run over the frames in order and over the rows in order, so that results are the same for any
 //! number of threads.
 
-use crate::{MaskStack, VideoShape};
+use crate::{MaskError, MaskStack, VideoShape};
 use multiversion::multiversion;
 use ndarray::parallel::prelude::*;
 use ndarray::{
@@ -41,6 +41,15 @@ pub trait SensingOperator: Send + Sync {
 
     /// `diag(H Hᵀ)` `[H, W]`, all ≥ 0. It is 0 where no mask is open; such a pixel is never divided by.
     fn gram_diag(&self) -> ArrayView2<'_, f32>;
+
+    /// This operator without the pixels where `measured` `[H, W]` is false: to it they are pixels that no mask opens.
+    ///
+    /// # Errors
+    /// [`MaskError::AllClosed`] if no open pixel is left.
+    ///
+    /// # Panics
+    /// If a size differs from [`SensingOperator::shape`].
+    fn restricted_to(&self, measured: ArrayView2<'_, bool>) -> Result<Box<dyn SensingOperator>, MaskError>;
 
     /// Moves `from` `[T, H, W]` towards the measurement in closed form and writes the result to `to`, see [`DataStep`].
     /// Returns how far `from` is from the measurement and from [`DataStep::previous`].
@@ -204,6 +213,10 @@ impl SensingOperator for MaskOperator {
 
     fn gram_diag(&self) -> ArrayView2<'_, f32> {
         self.gram.view()
+    }
+
+    fn restricted_to(&self, measured: ArrayView2<'_, bool>) -> Result<Box<dyn SensingOperator>, MaskError> {
+        Ok(Box::new(Self::new(self.masks.clone().restricted_to(measured)?)))
     }
 
     fn data_step(&self, step: DataStep<'_>, from: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>) -> Progress {
@@ -492,6 +505,9 @@ mod tests {
         }
         fn gram_diag(&self) -> ArrayView2<'_, f32> {
             self.0.gram_diag()
+        }
+        fn restricted_to(&self, measured: ArrayView2<'_, bool>) -> Result<Box<dyn SensingOperator>, MaskError> {
+            Ok(Box::new(Self(MaskOperator::new(self.0.masks.clone().restricted_to(measured)?))))
         }
     }
 

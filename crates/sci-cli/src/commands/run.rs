@@ -209,6 +209,7 @@ fn line(m: &MeasurementRecord) -> String {
     let note = match m.stop {
         Stop::ScheduleDone => "",
         Stop::Converged => "   converged",
+        Stop::Stalled => "   nothing gained any more",
         Stop::Diverged => "   DIVERGED (last good estimate)",
         Stop::TimeUp => "   time up",
         Stop::Observer => "   stopped",

@@ -1,0 +1,200 @@
+//! Owns what a run does not have to do: some measured pixels are held out, and say when a stage or the run has done its work.
+
+use crate::{Problem, SolveError};
+use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, Zip};
+use sci_forward::{SensingOperator, held_in};
+
+/// A part of the measurement is held out of the data steps to judge the iterates by, and stages that do nothing for it
+/// are cut short. The result is the best iterate.
+///
+/// The judge is the *predicted error*, an estimate of the mean square error of a pixel of a frame that needs no truth.
+/// With `r = y − H x`, `g = diag(H Hᵀ)` and T frames:
+///
+/// ```text
+/// E(x) = mean over held-out pixels of r²/g  +  mean over the others of r²/(g T)
+/// ```
+///
+/// At a pixel held out, r is a sum of T errors that no data step has touched, with variance g · MSE when they are
+/// independent. At the others it is the part of the error in the range of `Hᵀ`, 1/T of the dimensions, which a jump of σ
+/// makes large where the pixels held out see nothing.
+///
+/// A stage ends when an iteration takes less than `gain` off E, or when after `patience` iterations it has not gone below
+/// the best E before it. The run ends after two stages in a row that did not. A stage whose σ is more than `overshoot · √E`
+/// is not begun, unless it is the last: it would smooth more than there is to smooth.
+///
+/// | Parameter | Default | Purpose | Range |
+/// |---|---|---|---|
+/// | `spacing` | 12 | one pixel in each `spacing` × `spacing` block is held out | ≥ 2 |
+/// | `seed` | 0 | which one | |
+/// | `gain` | 0.03 | least share of E that an iteration takes off | `[0, 1)` |
+/// | `patience` | 3 | iterations to get below the best E of before | ≥ 2 |
+/// | `overshoot` | 1.6 | largest σ in units of `√E` | > 0 |
+///
+/// The defaults were chosen on clips that are in no benchmark.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HoldOut {
+    /// Side of the blocks that give up one pixel each.
+    pub spacing: usize,
+    /// Of the draw.
+    pub seed: u64,
+    /// The least share of E that an iteration must take off for its stage to go on.
+    pub gain: f64,
+    /// Iterations of a stage in which E may be above the best of the stages before.
+    pub patience: usize,
+    /// The largest σ of a stage, in units of `√E`.
+    pub overshoot: f64,
+}
+
+impl Default for HoldOut {
+    fn default() -> Self {
+        Self { spacing: 12, seed: 0, gain: 0.03, patience: 3, overshoot: 1.6 }
+    }
+}
+
+/// What the rule says after an iteration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    GoOn,
+    EndStage,
+    Stop,
+}
+
+/// When stages and runs end, from the predicted errors alone.
+#[derive(Debug)]
+struct Rule {
+    config: HoldOut,
+    /// The least error so far, and that before the stage.
+    best: f64,
+    best_before: f64,
+    /// The error of the iteration before.
+    last: f64,
+    in_stage: usize,
+    /// Stages in a row that did nothing.
+    failed: usize,
+}
+
+impl Rule {
+    /// `start` is the error of the video that the run starts from.
+    fn new(config: HoldOut, start: f64) -> Self {
+        Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0 }
+    }
+
+    fn skips(&self, sigma: f32) -> bool {
+        f64::from(sigma) > self.config.overshoot * self.best.sqrt()
+    }
+
+    /// Takes the error after an iteration; `last_of_stage` when the schedule ends the stage here.
+    fn observe(&mut self, error: f64, last_of_stage: bool) -> Verdict {
+        self.in_stage += 1;
+        let stalled = error > self.last * (1.0 - self.config.gain);
+        (self.last, self.best) = (error, self.best.min(error));
+        // The first iteration of a stage meets what the σ before has left; what it does says nothing about the stage.
+        let grace = if self.best < self.best_before { 2 } else { self.config.patience };
+        if !(last_of_stage || (stalled && self.in_stage >= grace)) {
+            return Verdict::GoOn;
+        }
+        self.failed = if self.best < self.best_before { 0 } else { self.failed + 1 };
+        (self.best_before, self.in_stage) = (self.best, 0);
+        if self.failed >= 2 { Verdict::Stop } else { Verdict::EndStage }
+    }
+}
+
+/// The pixels held out of one problem.
+pub(crate) struct HeldOut<'a> {
+    full: Problem<'a>,
+    operator: Box<dyn SensingOperator>,
+    /// y, 0 at the pixels held out.
+    y: Array2<f32>,
+    /// The weight of r² in E.
+    weight: Array2<f32>,
+}
+
+impl<'a> HeldOut<'a> {
+    /// Nothing where there are too few pixels to hold any out.
+    pub(crate) fn new(full: Problem<'a>, config: &HoldOut) -> Option<Self> {
+        let stays = held_in(full.y().dim(), config.spacing.max(2), config.seed);
+        let gram = full.operator().gram_diag();
+        let count = |kept: bool| {
+            Zip::from(&stays).and(gram).fold(0u32, |n, &stays, &gram| n + u32::from(gram > 0.0 && stays == kept))
+        };
+        let (held, used) = (count(false), count(true));
+        if held == 0 || used == 0 {
+            return None;
+        }
+        let operator = full.operator().restricted_to(stays.view()).ok()?;
+        let frames = full.operator().shape().frames as f32;
+        let weight = Zip::from(&stays).and(gram).map_collect(|&stays, &gram| match stays {
+            _ if gram <= 0.0 => 0.0,
+            true => 1.0 / (gram * frames * used as f32),
+            false => 1.0 / (gram * held as f32),
+        });
+        let y = Zip::from(full.y()).and(&stays).map_collect(|&y, &stays| if stays { y } else { 0.0 });
+        Some(Self { full, operator, y, weight })
+    }
+
+    /// What the solver is given.
+    pub(crate) fn problem(&self) -> Result<Problem<'_>, SolveError> {
+        Problem::new(self.operator.as_ref(), self.y.view())
+    }
+
+    /// E of an iterate.
+    pub(crate) fn error(&self, x: ArrayView3<'_, f32>) -> f64 {
+        let hx = self.full.operator().forward(x);
+        Zip::from(self.full.y())
+            .and(&hx)
+            .and(&self.weight)
+            .fold(0.0, |sum, &y, &hx, &weight| sum + f64::from(weight) * f64::from(y - hx).powi(2))
+    }
+}
+
+/// The rule, and the best iterate so far.
+pub(crate) struct Judge<'a, 'p> {
+    held_out: &'a HeldOut<'p>,
+    rule: Rule,
+    best: Option<Best>,
+}
+
+/// An iterate that is kept.
+pub(crate) struct Best {
+    error: f64,
+    pub(crate) estimate: Array3<f32>,
+    pub(crate) rgb: Option<Array4<f32>>,
+}
+
+impl<'a, 'p> Judge<'a, 'p> {
+    /// `start` is what the run starts from.
+    pub(crate) fn new(held_out: &'a HeldOut<'p>, config: HoldOut, start: ArrayView3<'_, f32>) -> Self {
+        Self { held_out, rule: Rule::new(config, held_out.error(start)), best: None }
+    }
+
+    /// Judges an iterate and keeps it if it is the best; returns E and what to do.
+    pub(crate) fn judge(
+        &mut self,
+        estimate: ArrayView3<'_, f32>,
+        rgb: Option<ArrayView4<'_, f32>>,
+        last_of_stage: bool,
+    ) -> (f64, Verdict) {
+        let error = self.held_out.error(estimate);
+        match &mut self.best {
+            Some(best) if error >= best.error => {}
+            Some(Best { error: best, estimate: x, rgb: x_rgb }) => {
+                *best = error;
+                x.assign(&estimate);
+                if let (Some(x_rgb), Some(rgb)) = (x_rgb, rgb) {
+                    x_rgb.assign(&rgb);
+                }
+            }
+            None => self.best = Some(Best { error, estimate: estimate.to_owned(), rgb: rgb.map(|rgb| rgb.to_owned()) }),
+        }
+        (error, self.rule.observe(error, last_of_stage))
+    }
+
+    /// Whether a stage with this σ has nothing to do.
+    pub(crate) fn skips(&self, sigma: f32) -> bool {
+        self.rule.skips(sigma)
+    }
+
+    pub(crate) fn into_best(self) -> Option<Best> {
+        self.best
+    }
+}
