@@ -32,6 +32,7 @@ mod problem;
 mod reference;
 mod schedule;
 mod solver;
+mod tiles;
 mod tv;
 mod two_stage;
 
@@ -45,5 +46,6 @@ pub use problem::{Problem, Start};
 pub use schedule::{Plan, Stage, StopRule};
 pub use sci_forward::BoxError;
 pub use solver::{Outcome, SolveError, Solver, StopReason, run};
+pub use tiles::{TileConfig, TileCounts, Tiles};
 pub use tv::Tv;
 pub use two_stage::{Convention, TwoStage, TwoStageParams, XStep};

@@ -1,0 +1,307 @@
+//! Owns the denoiser that leaves out what a scene does not need: tiles that stand still, and tiles that have settled.
+
+use crate::{BoxError, DenoiseCx, Denoiser};
+use ndarray::parallel::prelude::*;
+use ndarray::{Array3, Array4, ArrayView4, ArrayViewMut4, Axis, s};
+use std::cell::Cell;
+use std::ops::Range;
+use std::rc::Rc;
+
+/// Side of the blocks whose means tell motion from noise.
+const BLOCK: usize = 8;
+/// A call that would save less than this share of its pixels is made in one piece.
+const LEAST_SAVED: f64 = 0.1;
+
+/// What [`Tiles`] leaves out.
+///
+/// | Parameter | Default | Purpose | Range |
+/// |---|---|---|---|
+/// | `side` | 32 | side of a tile in pixels | even, ≥ 8 |
+/// | `halo` | 16 | pixels around a region that is denoised by itself | even |
+/// | `motion` | 4 | largest F of a still block | ≥ 1 |
+/// | `floor` | 1/255 | deviations of a block's mean that are no motion | ≥ 0 |
+/// | `settled` | 0.05 | largest change of a settled tile's input, in units of σ | ≥ 0 |
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TileConfig {
+    /// Side of a tile in pixels, even.
+    pub side: usize,
+    /// Pixels around a region that the denoiser is given besides it, even: what the region sees of its surroundings.
+    pub halo: usize,
+    /// The largest F of a block in which the frames agree.
+    pub motion: f32,
+    /// Root mean square deviation of block means, full scale 1, that is never motion.
+    pub floor: f32,
+    /// A tile is settled while the root mean square change of its input is at most this, in units of σ.
+    pub settled: f32,
+}
+
+impl Default for TileConfig {
+    fn default() -> Self {
+        Self { side: 32, halo: 16, motion: 4.0, floor: 1.0 / 255.0, settled: 0.05 }
+    }
+}
+
+/// Pixels that a denoiser was asked for, and those that it was spared.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TileCounts {
+    /// Pixels of all frames of all calls.
+    pub asked: u64,
+    /// Those that the inner denoiser has worked on, halos included.
+    pub done: u64,
+}
+
+impl TileCounts {
+    /// The share left out, 0 to 1.
+    pub fn skipped(&self) -> f64 {
+        if self.asked == 0 { 0.0 } else { (1.0 - self.done as f64 / self.asked as f64).max(0.0) }
+    }
+}
+
+/// Gives the inner denoiser only what is needed, judged anew at each call from its input alone.
+///
+/// * *Frames that agree.* Where nothing moves, the frames of the input differ by noise of the data step, which the masks
+///   make white. Of the deviations from the mean frame, a block of n pixels has the variance V over its pixels and the
+///   variance E of its T means; `F = n E / V` is 1 for white noise, and up to n where something moves. The frames of a
+///   tile agree when in each of its blocks `F ≤ motion` or `√E ≤ floor`. Its mean frame is then denoised once, for all.
+/// * *Settled.* A tile whose input has changed by less than `settled · σ` since it was last denoised, in the same stage,
+///   keeps its output. The solver goes on to push its input towards the measurement, so that a residual wakes it.
+///
+/// What is left is denoised in rectangles with a halo, or as a whole where that saves nothing. The inner denoiser must not
+/// depend on where in the picture it is; it is called with as many frames as there are, or with one.
+pub struct Tiles<D> {
+    inner: D,
+    config: TileConfig,
+    memory: Option<Memory>,
+    counts: Rc<Cell<TileCounts>>,
+}
+
+/// What was denoised last.
+struct Memory {
+    stage: usize,
+    /// For each tile the input of when it was last denoised.
+    input: Array4<f32>,
+    output: Array4<f32>,
+}
+
+/// What a tile needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Need {
+    /// Nothing.
+    Settled,
+    /// One frame.
+    MeanFrame,
+    /// Every frame.
+    Frames,
+}
+
+impl<D: Denoiser> Tiles<D> {
+    /// Around a denoiser. What is left out is added to `counts`.
+    ///
+    /// # Panics
+    /// If a setting is out of its range.
+    pub fn new(inner: D, config: TileConfig, counts: Rc<Cell<TileCounts>>) -> Self {
+        let TileConfig { side, halo, motion, floor, settled } = config;
+        assert!(side >= BLOCK && side % 2 == 0 && halo % 2 == 0, "tiles of {side} with a halo of {halo}: even, side ≥ {BLOCK}");
+        assert!(motion >= 1.0 && floor >= 0.0 && settled >= 0.0, "thresholds must be positive");
+        Self { inner, config, memory: None, counts }
+    }
+
+    fn count(&self, asked: usize, done: usize) {
+        let TileCounts { asked: before, done: done_before } = self.counts.get();
+        self.counts.set(TileCounts { asked: before + asked as u64, done: done_before + done as u64 });
+    }
+
+    /// What each tile of the grid needs.
+    fn needs(&self, cx: &DenoiseCx, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
+        let memory = self.memory.as_ref().filter(|m| m.stage == cx.stage && m.input.dim() == noisy.dim());
+        let config = self.config;
+        (0..grid.len())
+            .into_par_iter()
+            .map(|tile| {
+                let (rows, columns) = grid.tile(tile);
+                let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
+                let settled = memory.is_some_and(|memory| {
+                    let then = memory.input.slice(s![.., .., rows, columns]);
+                    let sum = ndarray::Zip::from(&now).and(&then).fold(0.0, |sum, a, b| sum + f64::from(a - b).powi(2));
+                    sum <= f64::from(config.settled * cx.sigma).powi(2) * now.len() as f64
+                });
+                match () {
+                    () if settled => Need::Settled,
+                    () if frames_agree(now, &config) => Need::MeanFrame,
+                    () => Need::Frames,
+                }
+            })
+            .collect()
+    }
+
+    /// Denoises the mean of all frames and puts it into the tiles that need no more.
+    fn denoise_mean(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        out: &mut ArrayViewMut4<'_, f32>,
+        tiles: &[(Range<usize>, Range<usize>)],
+    ) -> Result<(), BoxError> {
+        let mean = mean_frame(noisy).insert_axis(Axis(0));
+        let mut denoised = Array4::zeros(mean.dim());
+        self.inner.denoise(cx, mean.view(), denoised.view_mut())?;
+        for (rows, columns) in tiles {
+            let from = denoised.slice(s![0, .., rows.clone(), columns.clone()]);
+            for mut frame in out.slice_mut(s![.., .., rows.clone(), columns.clone()]).outer_iter_mut() {
+                frame.assign(&from);
+            }
+        }
+        Ok(())
+    }
+}
+
+impl<D: Denoiser> Denoiser for Tiles<D> {
+    fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        let (frames, _, height, width) = noisy.dim();
+        let grid = Grid { height, width, side: self.config.side };
+        let needs = self.needs(cx, noisy, grid);
+        let of = |need: Need| (0..needs.len()).filter(|&i| needs[i] == need).map(|i| grid.tile(i)).collect::<Vec<_>>();
+        let still = of(Need::MeanFrame);
+        let moving = rectangles(&needs, grid);
+        let with_halo: Vec<_> = moving.iter().map(|(r, c)| grid.grown(r, c, self.config.halo)).collect();
+        let area = |(rows, columns): &(Range<usize>, Range<usize>)| rows.len() * columns.len();
+        let all = frames * height * width;
+        let work = frames * with_halo.iter().map(area).sum::<usize>() + if still.is_empty() { 0 } else { height * width };
+        let whole = work as f64 > (1.0 - LEAST_SAVED) * all as f64;
+        self.count(all, if whole { all } else { work });
+        if whole {
+            self.inner.denoise(cx, noisy, out.view_mut())?;
+            self.memory = Some(Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
+            return Ok(());
+        }
+        if let Some(memory) = &self.memory {
+            for (rows, columns) in of(Need::Settled) {
+                let kept = memory.output.slice(s![.., .., rows.clone(), columns.clone()]);
+                out.slice_mut(s![.., .., rows, columns]).assign(&kept);
+            }
+        }
+        if !still.is_empty() {
+            self.denoise_mean(cx, noisy, &mut out, &still)?;
+        }
+        for ((rows, columns), (halo_rows, halo_columns)) in moving.iter().zip(&with_halo) {
+            let input = noisy.slice(s![.., .., halo_rows.clone(), halo_columns.clone()]).to_owned();
+            let mut denoised = Array4::zeros(input.dim());
+            self.inner.denoise(cx, input.view(), denoised.view_mut())?;
+            let (top, left) = (rows.start - halo_rows.start, columns.start - halo_columns.start);
+            let core = denoised.slice(s![.., .., top..top + rows.len(), left..left + columns.len()]);
+            out.slice_mut(s![.., .., rows.clone(), columns.clone()]).assign(&core);
+        }
+        let memory = self.memory.take().filter(|m| m.input.dim() == noisy.dim());
+        let mut memory = memory.unwrap_or_else(|| Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
+        memory.stage = cx.stage;
+        for (rows, columns) in of(Need::MeanFrame).into_iter().chain(of(Need::Frames)) {
+            let tile = s![.., .., rows, columns];
+            memory.input.slice_mut(tile.clone()).assign(&noisy.slice(tile.clone()));
+            memory.output.slice_mut(tile.clone()).assign(&out.slice(tile));
+        }
+        self.memory = Some(memory);
+        Ok(())
+    }
+
+    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
+        self.inner.rgb()
+    }
+}
+
+fn mean_frame(video: ArrayView4<'_, f32>) -> Array3<f32> {
+    video.mean_axis(Axis(0)).expect("a video has at least one frame")
+}
+
+/// Whether in each block of a tile `[T, C, h, w]` the frames differ by white noise only.
+fn frames_agree(tile: ArrayView4<'_, f32>, config: &TileConfig) -> bool {
+    let (frames, channels, height, width) = tile.dim();
+    let mean = mean_frame(tile);
+    let starts = |length: usize| (0..length).step_by(BLOCK);
+    starts(height).all(|top| {
+        starts(width).all(|left| {
+            let rows = top..(top + BLOCK).min(height);
+            let columns = left..(left + BLOCK).min(width);
+            let pixels = (rows.len() * columns.len()) as f32;
+            let mean = mean.slice(s![.., rows.clone(), columns.clone()]);
+            let (mut of_means, mut of_pixels) = (0f32, 0f32);
+            for frame in tile.slice(s![.., .., rows, columns]).outer_iter() {
+                for (channel, mean) in frame.outer_iter().zip(mean.outer_iter()) {
+                    let (mut sum, mut squares) = (0f32, 0f32);
+                    ndarray::Zip::from(channel).and(mean).for_each(|&x, &m| {
+                        sum += x - m;
+                        squares += (x - m) * (x - m);
+                    });
+                    of_means += (sum / pixels).powi(2);
+                    of_pixels += squares / pixels;
+                }
+            }
+            let n = (frames * channels) as f32;
+            let (of_means, of_pixels) = (of_means / n, of_pixels / n);
+            of_means <= config.floor * config.floor || pixels * of_means <= config.motion * of_pixels
+        })
+    })
+}
+
+/// A picture cut into square tiles, those at the right and bottom as small as need be.
+#[derive(Debug, Clone, Copy)]
+struct Grid {
+    height: usize,
+    width: usize,
+    side: usize,
+}
+
+impl Grid {
+    fn columns(self) -> usize {
+        self.width.div_ceil(self.side)
+    }
+
+    fn len(self) -> usize {
+        self.columns() * self.height.div_ceil(self.side)
+    }
+
+    /// The rows and columns of a tile.
+    fn tile(self, index: usize) -> (Range<usize>, Range<usize>) {
+        let (row, column) = (index / self.columns(), index % self.columns());
+        self.region(row..row + 1, column..column + 1)
+    }
+
+    /// The rows and columns of a rectangle of tiles.
+    fn region(self, rows: Range<usize>, columns: Range<usize>) -> (Range<usize>, Range<usize>) {
+        let pixels = |r: Range<usize>, end: usize| r.start * self.side..(r.end * self.side).min(end);
+        (pixels(rows, self.height), pixels(columns, self.width))
+    }
+
+    fn grown(self, rows: &Range<usize>, columns: &Range<usize>, by: usize) -> (Range<usize>, Range<usize>) {
+        let grow = |r: &Range<usize>, end: usize| r.start.saturating_sub(by)..(r.end + by).min(end);
+        (grow(rows, self.height), grow(columns, self.width))
+    }
+}
+
+/// Rectangles that cover the tiles that need every frame and no others: runs within a row, joined with equal ones below.
+fn rectangles(needs: &[Need], grid: Grid) -> Vec<(Range<usize>, Range<usize>)> {
+    let mut done: Vec<(Range<usize>, Range<usize>)> = Vec::new();
+    for (row, tiles) in needs.chunks(grid.columns()).enumerate() {
+        let mut column = 0;
+        for run in tiles.chunk_by(|a, b| (*a == Need::Frames) == (*b == Need::Frames)) {
+            let columns = column..column + run.len();
+            column = columns.end;
+            if run[0] != Need::Frames {
+                continue;
+            }
+            match done.iter_mut().find(|(rows, c)| rows.end == row && *c == columns) {
+                Some((rows, _)) => rows.end += 1,
+                None => done.push((row..row + 1, columns)),
+            }
+        }
+    }
+    done.into_iter().map(|(rows, columns)| grid.region(rows, columns)).collect()
+}
