@@ -146,10 +146,24 @@ fn not_toml() {
 
 #[test]
 fn what_is_not_there_yet_is_refused() {
-    for (argument, key) in
-        [("skip.enabled=true", "`skip.enabled` = true"), ("denoiser.kind=wnnm", "`denoiser.kind` = wnnm")]
-    {
-        fails(&bench(), &["--set", argument], 2, &[&format!("--set {argument}"), key, "not available yet"]);
+    fails(
+        &bench(),
+        &["--set", "denoiser.kind=wnnm"],
+        2,
+        &["--set denoiser.kind=wnnm", "`denoiser.kind` = wnnm", "not available yet"],
+    );
+}
+
+#[test]
+fn settings_of_skipping_are_checked() {
+    for (argument, needles) in [
+        ("skip.enabled=maybe", ["`skip.enabled` = maybe", "true"]),
+        ("skip.gain=2", ["`skip.gain` = 2", "0 to 0.5"]),
+        ("skip.spacing=1", ["`skip.spacing` = 1", "2 to 1024"]),
+        ("skip.tile=true", ["unknown key `skip.tile`", "did you mean `tiles`"]),
+    ] {
+        let needles: Vec<&str> = needles.to_vec();
+        fails(&bench(), &["--set", argument], 2, &needles);
     }
 }
 

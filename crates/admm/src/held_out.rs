@@ -198,3 +198,76 @@ impl<'a, 'p> Judge<'a, 'p> {
         self.best
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sci_forward::testing::moving_square;
+    use sci_forward::{MaskOperator, MaskStack, VideoShape};
+
+    /// How many of `errors` the rule looks at in stages of at most 6, where stages end, and whether it stops.
+    fn follow(start: f64, errors: &[f64]) -> (Vec<usize>, bool) {
+        let mut rule = Rule::new(HoldOut::default(), start);
+        let (mut ends, mut in_stage) = (Vec::new(), 0);
+        for (k, &error) in errors.iter().enumerate() {
+            in_stage += 1;
+            match rule.observe(error, in_stage == 6) {
+                Verdict::GoOn => continue,
+                Verdict::EndStage => ends.push(k),
+                Verdict::Stop => return (ends, true),
+            }
+            in_stage = 0;
+        }
+        (ends, false)
+    }
+
+    #[test]
+    fn a_stage_goes_on_while_it_gains() {
+        assert_eq!(follow(1.0, &[0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3]), (vec![5], false));
+    }
+
+    #[test]
+    fn a_stage_ends_where_its_gain_does() {
+        assert_eq!(follow(1.0, &[0.9, 0.8, 0.79]), (vec![2], false));
+    }
+
+    #[test]
+    fn a_bad_first_iteration_is_forgiven() {
+        assert_eq!(follow(1.0, &[0.5, 0.499, 0.9, 0.45, 0.4, 0.399]), (vec![1, 5], false));
+    }
+
+    #[test]
+    fn two_stages_that_only_lose_end_the_run() {
+        assert_eq!(follow(1.0, &[0.5, 0.499, 0.6, 0.61, 0.62, 0.55, 0.56, 0.57, 0.1]), (vec![1, 4], true));
+    }
+
+    #[test]
+    fn a_stage_that_would_smooth_too_much_is_skipped() {
+        let mut rule = Rule::new(HoldOut::default(), 1.0);
+        assert!(!rule.skips(0.5));
+        rule.observe(0.01, false);
+        assert!(rule.skips(0.17) && !rule.skips(0.15));
+    }
+
+    #[test]
+    fn pixels_held_out_are_hidden_from_the_solver_and_predict_the_error() {
+        let shape = VideoShape { frames: 4, height: 64, width: 64 };
+        let h = MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap());
+        let truth = moving_square(shape);
+        let y = h.forward(truth.view());
+        let problem = Problem::new(&h, y.view()).unwrap();
+        let pixels = HeldOut::new(problem, &HoldOut { spacing: 4, ..HoldOut::default() }).unwrap();
+        let given = pixels.problem().unwrap();
+        let closed = given.operator().gram_diag().iter().filter(|g| **g == 0.0).count();
+        let unopened = h.gram_diag().iter().filter(|g| **g == 0.0).count();
+        assert!(closed > unopened + 200, "{closed}");
+        assert!(pixels.error(truth.view()) < 1e-12);
+        // Independent errors of known size, here of alternating signs from pixel to pixel and frame to frame.
+        let mut noisy = truth;
+        let noise = sci_forward::testing::gaussian(shape.dim(), 5);
+        noisy.zip_mut_with(&noise, |x, n| *x += 0.1 * n);
+        let predicted = pixels.error(noisy.view());
+        // 1 + 1/T of the mean square error: at the pixels that the data step sees, nothing has been projected here.
+        assert!((predicted / 0.0125 - 1.0).abs() < 0.15, "{predicted}");
+    }
+}

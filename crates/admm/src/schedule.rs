@@ -37,7 +37,8 @@ pub struct Plan {
     pub stages: Vec<Stage>,
     /// The stop rule.
     pub stop: StopRule,
-    /// Whether stages are cut short, judged by held-out pixels; off if nothing. The numbers of iterations are then limits.
+    /// Whether stages are cut short, judged by held-out pixels; off if nothing. The numbers of iterations
+    /// are then limits, and what a stage leaves over of them is added to the next.
     pub hold_out: Option<HoldOut>,
 }
 

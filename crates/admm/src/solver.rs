@@ -137,7 +137,8 @@ pub fn run<S: Solver>(
         None => problem.reborrow(),
     };
     let start = start.video(&given)?;
-    let mut judge = held_out.as_ref().zip(plan.hold_out).map(|(pixels, config)| Judge::new(pixels, config, start.view()));
+    let mut judge =
+        held_out.as_ref().zip(plan.hold_out).map(|(pixels, config)| Judge::new(pixels, config, start.view()));
     let mut relative_residual = relative(given.operator().progress(given.y(), start.view(), start.view()), &given).0;
     let mut guard = Guard::new(&given, relative_residual, plan.stop.diverged_above);
     let mut state = solver.init(&given, start);
@@ -145,10 +146,14 @@ pub fn run<S: Solver>(
     observer.begin(plan).map_err(|source| SolveError::Observer { iteration: 0, source })?;
 
     let mut iterations = 0;
+    let mut spare = 0;
     let mut stop = StopReason::ScheduleDone;
     let mut last = Progress::default();
     'stages: for (stage, &crate::Stage { sigma, iterations: count }) in plan.stages.iter().enumerate() {
+        // What stages of a denoiser with a σ leave over is for those after them.
+        let count = count + if sigma > 0.0 { std::mem::take(&mut spare) } else { 0 };
         if stage + 1 < plan.stages.len() && judge.as_ref().is_some_and(|judge| judge.skips(sigma)) {
+            spare += count;
             continue;
         }
         for left in (0..count).rev() {
@@ -190,7 +195,10 @@ pub fn run<S: Solver>(
                 _ if verdict == Some(Verdict::Stop) => StopReason::Stalled,
                 _ if relative_change < plan.stop.relative_change => StopReason::Converged,
                 _ if plan.stop.time.is_some_and(|limit| clock.elapsed() >= limit) => StopReason::TimeUp,
-                _ if verdict == Some(Verdict::EndStage) => break,
+                _ if verdict == Some(Verdict::EndStage) => {
+                    spare += if sigma > 0.0 { left } else { 0 };
+                    break;
+                }
                 _ => continue,
             };
             break 'stages;

@@ -2,13 +2,15 @@
 
 use crate::{BoxError, DenoiseCx, Denoiser};
 use ndarray::parallel::prelude::*;
-use ndarray::{Array3, Array4, ArrayView4, ArrayViewMut4, Axis, s};
+use ndarray::{Array3, Array4, ArrayView4, ArrayViewMut4, Axis, Zip, s};
 use std::cell::Cell;
 use std::ops::Range;
 use std::rc::Rc;
 
-/// Side of the blocks whose means tell motion from noise.
-const BLOCK: usize = 8;
+/// Smallest side of a tile.
+const BLOCK: usize = 16;
+/// Mean square deviation of frames that never wakes a tile.
+const FLOOR: f64 = (2.0 / 255.0) * (2.0 / 255.0);
 /// A call that would save less than this share of its pixels is made in one piece.
 const LEAST_SAVED: f64 = 0.1;
 
@@ -16,10 +18,9 @@ const LEAST_SAVED: f64 = 0.1;
 ///
 /// | Parameter | Default | Purpose | Range |
 /// |---|---|---|---|
-/// | `side` | 32 | side of a tile in pixels | even, ≥ 8 |
+/// | `side` | 32 | side of a tile in pixels | even, ≥ 16 |
 /// | `halo` | 16 | pixels around a region that is denoised by itself | even |
-/// | `motion` | 4 | largest F of a still block | ≥ 1 |
-/// | `floor` | 1/255 | deviations of a block's mean that are no motion | ≥ 0 |
+/// | `wake` | 3 | growth of the frames' deviations that wakes a still tile | > 1 |
 /// | `settled` | 0.05 | largest change of a settled tile's input, in units of σ | ≥ 0 |
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileConfig {
@@ -27,17 +28,15 @@ pub struct TileConfig {
     pub side: usize,
     /// Pixels around a region that the denoiser is given besides it, even: what the region sees of its surroundings.
     pub halo: usize,
-    /// The largest F of a block in which the frames agree.
-    pub motion: f32,
-    /// Root mean square deviation of block means, full scale 1, that is never motion.
-    pub floor: f32,
+    /// A still tile whose frames come to differ by so many times the least that they differed moves after all.
+    pub wake: f64,
     /// A tile is settled while the root mean square change of its input is at most this, in units of σ.
     pub settled: f32,
 }
 
 impl Default for TileConfig {
     fn default() -> Self {
-        Self { side: 32, halo: 16, motion: 4.0, floor: 1.0 / 255.0, settled: 0.05 }
+        Self { side: 32, halo: 16, wake: 3.0, settled: 0.05 }
     }
 }
 
@@ -57,14 +56,13 @@ impl TileCounts {
     }
 }
 
-/// Gives the inner denoiser only what is needed, judged anew at each call from its input alone.
+/// Gives the inner denoiser only what is needed.
 ///
-/// * *Frames that agree.* Where nothing moves, the frames of the input differ by noise of the data step, which the masks
-///   make white. Of the deviations from the mean frame, a block of n pixels has the variance V over its pixels and the
-///   variance E of its T means; `F = n E / V` is 1 for white noise, and up to n where something moves. The frames of a
-///   tile agree when in each of its blocks `F ≤ motion` or `√E ≤ floor`. Its mean frame is then denoised once, for all.
-/// * *Settled.* A tile whose input has changed by less than `settled · σ` since it was last denoised, in the same stage,
-///   keeps its output. The solver goes on to push its input towards the measurement, so that a residual wakes it.
+/// * *Still tiles*, which the measurement tells ([`still`](crate::still)): the mean of their frames is denoised once, for all
+///   of them. Their frames differ by what the data step adds, frame by frame, to explain the measurement; a tile whose
+///   frames come to differ by `wake` times the least of before is woken for good, as no still picture explains it.
+/// * *Settled tiles.* A tile whose input has changed by less than `settled · σ` since it was last denoised, in the same
+///   stage, keeps its output. The solver goes on to push its input towards the measurement, so that a residual wakes it.
 ///
 /// What is left is denoised in rectangles with a halo, or as a whole where that saves nothing. The inner denoiser must not
 /// depend on where in the picture it is; it is called with as many frames as there are, or with one.
@@ -72,6 +70,8 @@ pub struct Tiles<D> {
     inner: D,
     config: TileConfig,
     memory: Option<Memory>,
+    /// For each tile the least deviation of its frames so far, in mean squares; nothing where it moves.
+    still: Vec<Option<f64>>,
     counts: Rc<Cell<TileCounts>>,
 }
 
@@ -95,15 +95,18 @@ enum Need {
 }
 
 impl<D: Denoiser> Tiles<D> {
-    /// Around a denoiser. What is left out is added to `counts`.
+    /// Around a denoiser; `still` says which tiles stand still, in rows, as [`still`](crate::still) finds them. What is
+    /// left out is added to `counts`.
     ///
     /// # Panics
     /// If a setting is out of its range.
-    pub fn new(inner: D, config: TileConfig, counts: Rc<Cell<TileCounts>>) -> Self {
-        let TileConfig { side, halo, motion, floor, settled } = config;
-        assert!(side >= BLOCK && side % 2 == 0 && halo % 2 == 0, "tiles of {side} with a halo of {halo}: even, side ≥ {BLOCK}");
-        assert!(motion >= 1.0 && floor >= 0.0 && settled >= 0.0, "thresholds must be positive");
-        Self { inner, config, memory: None, counts }
+    pub fn new(inner: D, config: TileConfig, still: &[bool], counts: Rc<Cell<TileCounts>>) -> Self {
+        let TileConfig { side, halo, wake, settled } = config;
+        let sizes = side >= BLOCK && side % 2 == 0 && halo % 2 == 0;
+        assert!(sizes, "tiles of {side} with a halo of {halo}: both must be even, a side at least {BLOCK}");
+        assert!(wake > 1.0 && settled >= 0.0, "wake = {wake} must be greater than 1, settled = {settled} at least 0");
+        let still = still.iter().map(|&still| still.then_some(f64::INFINITY)).collect();
+        Self { inner, config, memory: None, still, counts }
     }
 
     fn count(&self, asked: usize, done: usize) {
@@ -112,26 +115,30 @@ impl<D: Denoiser> Tiles<D> {
     }
 
     /// What each tile of the grid needs.
-    fn needs(&self, cx: &DenoiseCx, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
+    fn needs(&mut self, cx: &DenoiseCx, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
+        self.still.resize(grid.len(), None);
         let memory = self.memory.as_ref().filter(|m| m.stage == cx.stage && m.input.dim() == noisy.dim());
         let config = self.config;
-        (0..grid.len())
-            .into_par_iter()
-            .map(|tile| {
-                let (rows, columns) = grid.tile(tile);
-                let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
-                let settled = memory.is_some_and(|memory| {
-                    let then = memory.input.slice(s![.., .., rows, columns]);
-                    let sum = ndarray::Zip::from(&now).and(&then).fold(0.0, |sum, a, b| sum + f64::from(a - b).powi(2));
-                    sum <= f64::from(config.settled * cx.sigma).powi(2) * now.len() as f64
-                });
-                match () {
-                    () if settled => Need::Settled,
-                    () if frames_agree(now, &config) => Need::MeanFrame,
-                    () => Need::Frames,
-                }
-            })
-            .collect()
+        let need = |(tile, still): (usize, &mut Option<f64>)| {
+            let (rows, columns) = grid.tile(tile);
+            let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
+            if let Some(least) = still {
+                let deviation = deviation(now);
+                let awake = deviation > FLOOR.max(*least * config.wake.powi(2));
+                *still = if awake { None } else { Some(least.min(deviation)) };
+            }
+            let settled = memory.is_some_and(|memory| {
+                let then = memory.input.slice(s![.., .., rows, columns]);
+                let sum = Zip::from(&now).and(&then).fold(0.0, |sum, a, b| sum + f64::from(a - b).powi(2));
+                sum <= f64::from(config.settled * cx.sigma).powi(2) * now.len() as f64
+            });
+            match still {
+                _ if settled => Need::Settled,
+                Some(_) => Need::MeanFrame,
+                None => Need::Frames,
+            }
+        };
+        self.still.par_iter_mut().enumerate().map(need).collect()
     }
 
     /// Denoises the mean of all frames and puts it into the tiles that need no more.
@@ -175,7 +182,8 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
         let with_halo: Vec<_> = moving.iter().map(|(r, c)| grid.grown(r, c, self.config.halo)).collect();
         let area = |(rows, columns): &(Range<usize>, Range<usize>)| rows.len() * columns.len();
         let all = frames * height * width;
-        let work = frames * with_halo.iter().map(area).sum::<usize>() + if still.is_empty() { 0 } else { height * width };
+        let work =
+            frames * with_halo.iter().map(area).sum::<usize>() + if still.is_empty() { 0 } else { height * width };
         let whole = work as f64 > (1.0 - LEAST_SAVED) * all as f64;
         self.count(all, if whole { all } else { work });
         if whole {
@@ -201,7 +209,8 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
             out.slice_mut(s![.., .., rows.clone(), columns.clone()]).assign(&core);
         }
         let memory = self.memory.take().filter(|m| m.input.dim() == noisy.dim());
-        let mut memory = memory.unwrap_or_else(|| Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
+        let mut memory =
+            memory.unwrap_or_else(|| Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
         memory.stage = cx.stage;
         for (rows, columns) in of(Need::MeanFrame).into_iter().chain(of(Need::Frames)) {
             let tile = s![.., .., rows, columns];
@@ -221,55 +230,35 @@ fn mean_frame(video: ArrayView4<'_, f32>) -> Array3<f32> {
     video.mean_axis(Axis(0)).expect("a video has at least one frame")
 }
 
-/// Whether in each block of a tile `[T, C, h, w]` the frames differ by white noise only.
-fn frames_agree(tile: ArrayView4<'_, f32>, config: &TileConfig) -> bool {
-    let (frames, channels, height, width) = tile.dim();
+/// Mean square of the differences of the frames of a tile `[T, C, h, w]` from their mean.
+fn deviation(tile: ArrayView4<'_, f32>) -> f64 {
     let mean = mean_frame(tile);
-    let starts = |length: usize| (0..length).step_by(BLOCK);
-    starts(height).all(|top| {
-        starts(width).all(|left| {
-            let rows = top..(top + BLOCK).min(height);
-            let columns = left..(left + BLOCK).min(width);
-            let pixels = (rows.len() * columns.len()) as f32;
-            let mean = mean.slice(s![.., rows.clone(), columns.clone()]);
-            let (mut of_means, mut of_pixels) = (0f32, 0f32);
-            for frame in tile.slice(s![.., .., rows, columns]).outer_iter() {
-                for (channel, mean) in frame.outer_iter().zip(mean.outer_iter()) {
-                    let (mut sum, mut squares) = (0f32, 0f32);
-                    ndarray::Zip::from(channel).and(mean).for_each(|&x, &m| {
-                        sum += x - m;
-                        squares += (x - m) * (x - m);
-                    });
-                    of_means += (sum / pixels).powi(2);
-                    of_pixels += squares / pixels;
-                }
-            }
-            let n = (frames * channels) as f32;
-            let (of_means, of_pixels) = (of_means / n, of_pixels / n);
-            of_means <= config.floor * config.floor || pixels * of_means <= config.motion * of_pixels
-        })
-    })
+    let sum = tile
+        .outer_iter()
+        .map(|frame| Zip::from(frame).and(&mean).fold(0.0, |sum, x, m| sum + f64::from(x - m).powi(2)))
+        .sum::<f64>();
+    sum / tile.len() as f64
 }
 
 /// A picture cut into square tiles, those at the right and bottom as small as need be.
 #[derive(Debug, Clone, Copy)]
-struct Grid {
-    height: usize,
-    width: usize,
-    side: usize,
+pub(crate) struct Grid {
+    pub(crate) height: usize,
+    pub(crate) width: usize,
+    pub(crate) side: usize,
 }
 
 impl Grid {
-    fn columns(self) -> usize {
+    pub(crate) fn columns(self) -> usize {
         self.width.div_ceil(self.side)
     }
 
-    fn len(self) -> usize {
+    pub(crate) fn len(self) -> usize {
         self.columns() * self.height.div_ceil(self.side)
     }
 
     /// The rows and columns of a tile.
-    fn tile(self, index: usize) -> (Range<usize>, Range<usize>) {
+    pub(crate) fn tile(self, index: usize) -> (Range<usize>, Range<usize>) {
         let (row, column) = (index / self.columns(), index % self.columns());
         self.region(row..row + 1, column..column + 1)
     }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use admm::{
     Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Gap, MomentumStart, Observer, Outcome, PerLattice, PerStage,
-    Plan, Problem, SolveError, Start, StopRule, Tv, TwoStage,
+    Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage,
 };
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
@@ -89,6 +89,7 @@ impl<'e> Factory<'e> {
             time: experiment.seconds.map(Duration::from_secs_f64),
             ..StopRule::default()
         };
+        plan.hold_out = experiment.skip.map(|s| s.hold_out);
         let sequence = experiment.online.map(|o| Sequence::new(o.sequence)).transpose()?;
         Ok(Self { experiment, parts, color, plan, sequence })
     }
@@ -117,7 +118,7 @@ impl<'e> Factory<'e> {
             None => (normal, self.plan.clone()),
         };
         let problem = Problem::new(scene.operator.as_ref(), scene.measurement(k))?;
-        let (outcome, denoiser_calls) = self.run(&problem, start, &plan, observer)?;
+        let (outcome, work) = self.run(&problem, start, &plan, observer)?;
         if let Some(sequence) = &mut self.sequence {
             sequence.finish(outcome.estimate.view());
         }
@@ -130,7 +131,7 @@ impl<'e> Factory<'e> {
             counts: Counts::of(&updates),
             updates,
         });
-        Ok(Solved { outcome, planned: plan.iterations(), denoiser_calls, adaptation })
+        Ok(Solved { outcome, planned: plan.iterations(), work, adaptation })
     }
 
     /// What is known of a measurement from those before, where networks adapt; all of them turn to it.
@@ -147,21 +148,26 @@ impl<'e> Factory<'e> {
         start: Start<'_>,
         plan: &Plan,
         observer: &mut dyn Observer,
-    ) -> Result<(Outcome<()>, usize), SolveError> {
+    ) -> Result<(Outcome<()>, Work), SolveError> {
         let calls = Rc::new(Cell::new(0));
         let color = self.color.as_ref();
-        let denoiser = Counted { inner: denoiser(self.experiment, &mut self.parts, color), calls: Rc::clone(&calls) };
+        let begin = Instant::now();
+        let tiles = StillTiles::of(self.experiment, problem);
+        let looked = begin.elapsed().as_secs_f64();
+        let inner = denoiser(self.experiment, &mut self.parts, color, &tiles);
+        let denoiser = Counted { inner, calls: Rc::clone(&calls) };
         let mut outcome = match (self.experiment.solver, color) {
             (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
                 let mut solver = TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params);
                 without_state(admm::run(&mut solver, problem, start, plan, observer)?)
             }
             (Solver::Gap { momentum }, _) => {
-                let mut gap = match momentum {
+                let gap = match momentum {
                     None => Gap::plain(denoiser),
                     Some(Momentum::Zero) => Gap::with_momentum(denoiser, MomentumStart::Zero),
                     Some(Momentum::Measurement) => Gap::with_momentum(denoiser, MomentumStart::Measurement),
                 };
+                let mut gap = if self.experiment.skip.is_some() { gap.restarting() } else { gap };
                 without_state(admm::run(&mut gap, problem, start, plan, observer)?)
             }
             (Solver::Admm { gamma }, _) => {
@@ -173,7 +179,8 @@ impl<'e> Factory<'e> {
         if let Some(sensor) = color {
             sensor.complete(&mut outcome)?;
         }
-        Ok((outcome, calls.get()))
+        outcome.seconds += looked;
+        Ok((outcome, Work { calls: calls.get(), skipped_tiles: tiles.counts.get().skipped() }))
     }
 
     /// Writes the weights as they are now, of each network one file `adapted-N-KIND.safetensors`, N its place among the
@@ -214,23 +221,62 @@ impl Sensor {
 }
 
 /// The prior of a solve: on gray or, for the two-stage solver, RGB video as it is; else on the mosaic.
-fn denoiser<'p>(experiment: &Experiment, parts: &'p mut [Part], color: Option<&Sensor>) -> PerStage<'p> {
+fn denoiser<'p>(
+    experiment: &Experiment,
+    parts: &'p mut [Part],
+    color: Option<&Sensor>,
+    tiles: &StillTiles,
+) -> PerStage<'p> {
     let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
     let denoisers = parts.iter_mut().map(|part| match (part, on_mosaic) {
         (Part::Tv { weight, inner }, sensor) => {
             let tv = Tv::new(*weight).inner(*inner);
             if sensor.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) }
         }
-        (Part::Ffdnet(net), None) => boxed(net),
-        (Part::Fastdvdnet(net), None) => boxed(net),
-        (Part::Ffdnet(net), Some(s)) => boxed(Demosaicked::new(net, s.demosaicer.clone(), s.cfa)),
-        (Part::Fastdvdnet(net), Some(s)) => boxed(Demosaicked::new(net, s.demosaicer.clone(), s.cfa)),
+        (Part::Ffdnet(net), None) => tiles.spare(net),
+        (Part::Fastdvdnet(net), None) => tiles.spare(net),
+        (Part::Ffdnet(net), Some(s)) => boxed(Demosaicked::new(tiles.spare(net), s.demosaicer.clone(), s.cfa)),
+        (Part::Fastdvdnet(net), Some(s)) => boxed(Demosaicked::new(tiles.spare(net), s.demosaicer.clone(), s.cfa)),
     });
     PerStage::new(denoisers.collect(), experiment.stages.iter().map(|s| s.denoiser).collect())
 }
 
 fn boxed<'a>(denoiser: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
     Box::new(denoiser)
+}
+
+/// What the denoiser of a solve did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Work {
+    /// Its calls.
+    pub calls: usize,
+    /// The share of the pixels of these calls that was left out.
+    pub skipped_tiles: f64,
+}
+
+/// Which tiles of a measurement stand still, for networks that may be spared them.
+struct StillTiles {
+    config: TileConfig,
+    /// Nothing when they may not.
+    still: Option<Vec<bool>>,
+    counts: Rc<Cell<TileCounts>>,
+}
+
+impl StillTiles {
+    /// A network that adapts is given everything: its updates look at the whole measurement.
+    fn of(experiment: &Experiment, problem: &Problem<'_>) -> Self {
+        let config = TileConfig::default();
+        let wanted = experiment.skip.is_some_and(|s| s.tiles) && experiment.online.is_none();
+        let still = wanted.then(|| admm::still(problem, config.side));
+        Self { config, still, counts: Rc::default() }
+    }
+
+    fn spare<'a>(&self, net: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
+        match &self.still {
+            Some(still) => Box::new(Tiles::new(net, self.config, still, Rc::clone(&self.counts))),
+            None => Box::new(net),
+        }
+    }
 }
 
 /// The outcome of one measurement, whatever the solver.
@@ -240,8 +286,8 @@ pub struct Solved {
     pub outcome: Outcome<()>,
     /// The iterations that were to be run.
     pub planned: usize,
-    /// Calls of the denoiser.
-    pub denoiser_calls: usize,
+    /// What the denoiser did.
+    pub work: Work,
     /// How the denoiser adapted, where it was to.
     pub adaptation: Option<Adaptation>,
 }

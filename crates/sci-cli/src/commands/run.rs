@@ -162,11 +162,14 @@ fn solve_all(
 }
 
 fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, trace: Trace, whole: usize) -> Solution {
-    let Solved { outcome, planned, denoiser_calls, adaptation } = solved;
+    let Solved { outcome, planned, work, adaptation } = solved;
     let x = outcome.estimate.view();
     // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
     // does not.
-    let left = if outcome.stop == StopReason::Converged { planned - outcome.iterations } else { 0 };
+    let left = match outcome.stop {
+        StopReason::ScheduleDone | StopReason::Converged | StopReason::Stalled => planned - outcome.iterations,
+        StopReason::Diverged | StopReason::TimeUp | StopReason::Observer => 0,
+    };
     let counts = adaptation.as_ref().map(|a| a.counts).unwrap_or_default();
     let record = MeasurementRecord {
         index,
@@ -179,8 +182,8 @@ fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, tr
         stop: outcome.stop.into(),
         relative_residual: Some(outcome.relative_residual),
         updates: counts.kept,
-        denoiser_calls,
-        skipped: Skipped { iterations: whole - planned + left, updates: counts.skipped, ..Skipped::default() },
+        denoiser_calls: work.calls,
+        skipped: Skipped { iterations: whole - planned + left, tiles: work.skipped_tiles, updates: counts.skipped },
         online: adaptation,
         trace,
     };

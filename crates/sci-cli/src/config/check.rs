@@ -9,6 +9,7 @@ use toml::Value as Toml;
 
 use super::adaptation::Online;
 use super::file::*;
+use super::skipping::{AUTO, Skip};
 use super::source::{ConfigError, Source};
 use crate::io::defects::Defects;
 use crate::io::scene::{Axes, Keys, Reading};
@@ -231,6 +232,8 @@ pub struct Checked {
     pub relative_change: f64,
     /// Stop a measurement after so many seconds.
     pub seconds: Option<f64>,
+    /// `[skip]`, if it is enabled.
+    pub skip: Option<Skip>,
     /// `[online]`, if it is enabled.
     pub online: Option<Online>,
     /// `[output]`.
@@ -286,8 +289,8 @@ impl<'s> Checker<'s> {
         let missing = |key: &str| self.source.file_error(format!("no [{key}] table"));
         let data = self.data(data.ok_or_else(|| missing("data"))?, seed)?;
         let (solver, start, demosaicer) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
-        let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named)?;
-        self.switched_off("skip", skip)?;
+        let skip = self.skip(skip, seed)?;
+        let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named, skip.is_some())?;
         let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
         let name = self.name(top.name)?;
@@ -303,6 +306,7 @@ impl<'s> Checker<'s> {
             stages,
             relative_change,
             seconds,
+            skip,
             online,
             output,
         })
@@ -514,19 +518,20 @@ impl<'s> Checker<'s> {
         default: Option<Section<'s>>,
         stages: Vec<Section<'s>>,
         named: Option<Section<'s>>,
+        skips: bool,
     ) -> Result<(Vec<Denoiser>, Vec<Stage>), ConfigError> {
         let mut denoisers = default.map(|d| self.denoiser(d)).transpose()?.into_iter().collect::<Vec<_>>();
         let has_default = !denoisers.is_empty();
         let mut schedules = Vec::new();
         if let Some(mut named) = named {
             for name in named.keys() {
-                let stages = self.stages(&mut denoisers, has_default, named.take_list(&name)?)?;
+                let stages = self.stages(&mut denoisers, has_default, named.take_list(&name)?, skips)?;
                 schedules.push((name, stages));
             }
         }
         let names: Vec<String> = schedules.iter().map(|(name, _)| name.clone()).collect();
         let legal = if names.is_empty() { "none, as there is no [schedules]".to_owned() } else { names.join(", ") };
-        let unnamed = self.stages(&mut denoisers, has_default, stages)?;
+        let unnamed = self.stages(&mut denoisers, has_default, stages, skips)?;
         let stages = match self.text("schedule", chosen, &legal, |c| names.iter().any(|n| n == c))? {
             Some(chosen) => schedules.into_iter().find(|(n, _)| *n == chosen).map_or(unnamed, |(_, stages)| stages),
             None => unnamed,
@@ -548,6 +553,7 @@ impl<'s> Checker<'s> {
         denoisers: &mut Vec<Denoiser>,
         has_default: bool,
         sections: Vec<Section<'s>>,
+        skips: bool,
     ) -> Result<Vec<Stage>, ConfigError> {
         let mut stages = Vec::new();
         for mut section in sections {
@@ -565,7 +571,16 @@ impl<'s> Checker<'s> {
                 }
             };
             let k: StageKeys = section.read(&["denoiser"])?;
-            let sigma = self.number(&format!("{key}.sigma"), &k.sigma, 0.0..=255.0)?;
+            let auto = k.sigma.as_ref().filter(|sigma| sigma.get_ref().as_str() == Some("auto"));
+            let sigma = match auto {
+                None => self.number(&format!("{key}.sigma"), &k.sigma, 0.0..=255.0)?,
+                Some(sigma) if !skips => {
+                    let problem =
+                        format!("`{key}.sigma` = \"auto\" is decided by held-out pixels: it needs skip.enabled = true");
+                    return Err(self.source.error(&sigma.span(), problem));
+                }
+                Some(_) => Some(AUTO[0]),
+            };
             let iterations =
                 self.whole(&format!("{key}.iterations"), &k.iterations, 0..=MAX_ITERATIONS)?.ok_or_else(|| {
                     self.source.error(&span, format!("`{key}.iterations` is missing; legal: 0 to {MAX_ITERATIONS}"))
@@ -586,7 +601,10 @@ impl<'s> Checker<'s> {
                     ));
                 }
             };
-            stages.push(Stage { sigma, iterations: iterations as usize, denoiser });
+            let more = if auto.is_some() { &AUTO[1..] } else { &[] };
+            for sigma in std::iter::once(sigma).chain(more.iter().map(|&sigma| sigma as f32)) {
+                stages.push(Stage { sigma, iterations: iterations as usize, denoiser });
+            }
         }
         Ok(stages)
     }
@@ -615,16 +633,6 @@ impl<'s> Checker<'s> {
                 })
             }
             _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, ffdnet, fastdvdnet")),
-        }
-    }
-
-    fn switched_off(&self, key: &str, section: Option<Section<'s>>) -> Result<(), ConfigError> {
-        let Some(section) = section else { return Ok(()) };
-        let k: SwitchKeys = section.read(&[])?;
-        let enabled = format!("{key}.enabled");
-        match (self.flag(&enabled, &k.enabled)?, &k.enabled) {
-            (Some(true), Some(value)) => Err(self.not_yet(&enabled, &value.span(), "false")),
-            _ => Ok(()),
         }
     }
 

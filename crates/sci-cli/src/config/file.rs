@@ -197,8 +197,14 @@ pub struct OnlineKeys {
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
-pub struct SwitchKeys {
+pub struct SkipKeys {
     pub enabled: Value,
+    pub spacing: Value,
+    pub gain: Value,
+    pub patience: Value,
+    pub overshoot: Value,
+    pub tiles: Value,
+    pub cheap_first: Value,
 }
 
 /// `[output]`.

@@ -8,6 +8,7 @@ pub mod adaptation;
 pub mod check;
 pub mod file;
 pub mod resolve;
+pub mod skipping;
 pub mod source;
 
 pub use resolve::{Experiment, load};

@@ -3,11 +3,12 @@
 use std::env;
 use std::path::{Path, PathBuf};
 
-use admm::{Convention, XStep};
+use admm::{Convention, HoldOut, XStep};
 use nets::Ends;
 use serde_json::{Value, json};
 
 use super::check::{self, Checked, Mask, Momentum, PathSetting};
+use super::skipping::{Skip, cheap_first};
 use super::source::{ConfigError, Place, Source};
 use crate::io::defects::Defects;
 use crate::io::scene::{Axes, Reading};
@@ -126,6 +127,8 @@ pub struct Experiment {
     pub relative_change: f64,
     /// Stop a measurement after so many seconds.
     pub seconds: Option<f64>,
+    /// What is left out, if anything may be.
+    pub skip: Option<Skip>,
     /// How networks adapt while they solve, if they do.
     pub online: Option<Online>,
     /// What to write.
@@ -193,7 +196,7 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .map(|s| Stage { sigma: s.sigma / SIGMA_UNIT, iterations: s.iterations, denoiser: s.denoiser })
         .collect();
     let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
-    Ok(Experiment {
+    let mut experiment = Experiment {
         name: checked.name.unwrap_or_else(stem),
         seed: checked.seed,
         data,
@@ -204,9 +207,12 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         stages,
         relative_change: checked.relative_change,
         seconds: checked.seconds,
+        skip: checked.skip,
         online: checked.online,
         output: checked.output,
-    })
+    };
+    cheap_first(&mut experiment);
+    Ok(experiment)
 }
 
 /// The folders a relative path is looked up in.
@@ -325,7 +331,7 @@ impl Experiment {
                 .map(|s| json!({ "sigma": s.sigma, "iterations": s.iterations, "denoiser": s.denoiser }))
                 .collect::<Vec<_>>(),
             "stop": { "relative_change": self.relative_change, "seconds": self.seconds },
-            "skip": { "enabled": false },
+            "skip": self.skip.as_ref().map_or_else(|| json!({ "enabled": false }), skip_json),
             "online": self.online.as_ref().map_or_else(|| json!({ "enabled": false }), online_json),
             "output": {
                 "format": match self.output.format { OutputFormat::Npy => "npy", OutputFormat::Npz => "npz", OutputFormat::Mat => "mat" },
@@ -398,6 +404,14 @@ impl Experiment {
         };
         value
     }
+}
+
+fn skip_json(s: &Skip) -> Value {
+    let HoldOut { spacing, seed, gain, patience, overshoot } = s.hold_out;
+    json!({
+        "enabled": true, "spacing": spacing, "seed": seed, "gain": gain, "patience": patience, "overshoot": overshoot,
+        "tiles": s.tiles, "cheap_first": s.cheap_first,
+    })
 }
 
 fn online_json(o: &Online) -> Value {

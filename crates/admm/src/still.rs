@@ -1,0 +1,212 @@
+//! Owns the question which parts of a scene stand still, asked of the measurement alone.
+
+use crate::Problem;
+use crate::tiles::Grid;
+use ndarray::parallel::prelude::*;
+use ndarray::{Array1, Array2, Array3};
+
+/// Side of the blocks that are tested.
+const BLOCK: usize = 16;
+/// Largest F of a still block.
+const LARGEST_F: f64 = 3.0;
+/// Largest correlation of a still tile.
+const LARGEST_CORRELATION: f64 = 0.12;
+
+/// Which tiles of `side` × `side` pixels stand still, in rows.
+///
+/// Of a scene that stands still, `s = y / Σ_t C_t` is a picture of it, and the difference d of two neighbours in s has
+/// nothing to do with which masks are open there. Where something moves, s is mottled by the masks. With
+/// `w_t = C_t(p)/ΣC(p) − C_t(q)/ΣC(q)` for neighbours p and q in a row:
+///
+/// * if the brightness of a block changes from frame to frame, `d = Σ_t w_t x_t + …`: in each block of 16 × 16 pixels the share of
+///   d² that w explains by least squares, in units of what it explains of noise (F of T − 1 degrees of freedom), is at most 3;
+/// * if only its texture moves, `|d|` is larger where `‖w‖` is: the correlation of the two over the tile is at most 0.12.
+///
+/// Masks that are alike everywhere cannot tell, nor blocks with too few open pixels: such tiles are not called still.
+pub fn still(problem: &Problem<'_>, side: usize) -> Vec<bool> {
+    let (frames, height, width) = problem.operator().shape().dim();
+    let grid = Grid { height, width, side };
+    let masks = problem.operator().adjoint(Array2::ones((height, width)).view());
+    let sum = masks.sum_axis(ndarray::Axis(0));
+    let picture = Picture { masks, sum, problem };
+    (0..grid.len())
+        .into_par_iter()
+        .map(|tile| {
+            let (rows, columns) = grid.tile(tile);
+            let mut of_tile = Correlation::default();
+            let mut blocks_are_still = true;
+            for top in rows.clone().step_by(BLOCK) {
+                for left in columns.clone().step_by(BLOCK) {
+                    let mut fit = Fit::new(frames);
+                    for row in top..(top + BLOCK).min(rows.end) {
+                        for column in left..(left + BLOCK).min(columns.end).min(width - 1) {
+                            if let Some((d, w)) = picture.difference(row, column) {
+                                of_tile.add(d.abs(), w.dot(&w).sqrt());
+                                fit.add(d, &w);
+                            }
+                        }
+                    }
+                    blocks_are_still &= fit.is_noise();
+                }
+            }
+            blocks_are_still && of_tile.is_none()
+        })
+        .collect()
+}
+
+struct Picture<'a, 'p> {
+    masks: Array3<f32>,
+    sum: Array2<f32>,
+    problem: &'a Problem<'p>,
+}
+
+impl Picture<'_, '_> {
+    /// d and w of a pixel and its right neighbour, if both are open.
+    fn difference(&self, row: usize, column: usize) -> Option<(f64, Array1<f64>)> {
+        let (p, q) = ([row, column], [row, column + 1]);
+        let (sum_p, sum_q) = (f64::from(self.sum[p]), f64::from(self.sum[q]));
+        if sum_p <= 0.0 || sum_q <= 0.0 {
+            return None;
+        }
+        let d = f64::from(self.problem.y()[p]) / sum_p - f64::from(self.problem.y()[q]) / sum_q;
+        let mask = |at: [usize; 2], t: usize| f64::from(self.masks[[t, at[0], at[1]]]);
+        let w = (0..self.masks.dim().0).map(|t| mask(p, t) / sum_p - mask(q, t) / sum_q).collect();
+        Some((d, w))
+    }
+}
+
+/// Least squares of d by w.
+struct Fit {
+    /// `Σ w wᵀ` and `Σ w d`.
+    normal: Array2<f64>,
+    right: Array1<f64>,
+    squares: f64,
+    count: usize,
+}
+
+impl Fit {
+    fn new(frames: usize) -> Self {
+        Self { normal: Array2::zeros((frames, frames)), right: Array1::zeros(frames), squares: 0.0, count: 0 }
+    }
+
+    fn add(&mut self, d: f64, w: &Array1<f64>) {
+        for (mut row, &a) in self.normal.outer_iter_mut().zip(w) {
+            row.scaled_add(a, w);
+        }
+        self.right.scaled_add(d, w);
+        self.squares += d * d;
+        self.count += 1;
+    }
+
+    /// Whether w explains no more of d than of noise.
+    fn is_noise(mut self) -> bool {
+        let freedom = self.right.len() - 1;
+        if freedom == 0 || self.count < 4 * self.right.len() {
+            return false;
+        }
+        // The components of w sum to 0: the direction of equal frames is free, and anything may be put there.
+        let scale = self.normal.diag().sum() / self.right.len() as f64;
+        if scale <= 0.0 {
+            return false;
+        }
+        self.normal += scale;
+        let explained = solve(self.normal, &self.right).map_or(f64::INFINITY, |x| x.dot(&self.right));
+        let rest = (self.squares - explained).max(0.0) / (self.count - freedom) as f64;
+        explained <= LARGEST_F * freedom as f64 * rest || self.squares <= 1e-8 * self.count as f64
+    }
+}
+
+/// `a x = b` for a symmetric positive definite `a` by Cholesky's decomposition; nothing if it is not.
+fn solve(mut a: Array2<f64>, b: &Array1<f64>) -> Option<Array1<f64>> {
+    let n = b.len();
+    let mut x = b.clone();
+    for j in 0..n {
+        let pivot = a[[j, j]] - (0..j).map(|k| a[[j, k]] * a[[j, k]]).sum::<f64>();
+        if pivot <= 1e-9 * a[[j, j]].abs() {
+            return None;
+        }
+        a[[j, j]] = pivot.sqrt();
+        for i in j + 1..n {
+            let dot: f64 = (0..j).map(|k| a[[i, k]] * a[[j, k]]).sum();
+            a[[i, j]] = (a[[i, j]] - dot) / a[[j, j]];
+        }
+    }
+    for i in 0..n {
+        let dot: f64 = (0..i).map(|k| a[[i, k]] * x[k]).sum();
+        x[i] = (x[i] - dot) / a[[i, i]];
+    }
+    for i in (0..n).rev() {
+        let dot: f64 = (i + 1..n).map(|k| a[[k, i]] * x[k]).sum();
+        x[i] = (x[i] - dot) / a[[i, i]];
+    }
+    Some(x)
+}
+
+/// Sums of a correlation.
+#[derive(Default)]
+struct Correlation {
+    n: f64,
+    x: f64,
+    y: f64,
+    xx: f64,
+    yy: f64,
+    xy: f64,
+}
+
+impl Correlation {
+    fn add(&mut self, x: f64, y: f64) {
+        self.n += 1.0;
+        self.x += x;
+        self.y += y;
+        self.xx += x * x;
+        self.yy += y * y;
+        self.xy += x * y;
+    }
+
+    fn is_none(&self) -> bool {
+        let covariance = self.n * self.xy - self.x * self.y;
+        let variances = (self.n * self.xx - self.x * self.x) * (self.n * self.yy - self.y * self.y);
+        covariance <= LARGEST_CORRELATION * variances.max(0.0).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+
+    const SHAPE: VideoShape = VideoShape { frames: 8, height: 64, width: 96 };
+
+    /// A picture with texture and edges.
+    fn scene(row: f64, column: f64) -> f32 {
+        let texture = (0.9 * row + 0.4 * column).sin() * (0.31 * column).cos() + (0.07 * row * column / 8.0).sin();
+        (0.5 + 0.15 * texture + if (column / 20.0) as i64 % 2 == 0 { 0.15 } else { 0.0 }) as f32
+    }
+
+    fn tiles(video: impl Fn(usize, usize, usize) -> f32) -> Vec<bool> {
+        let h = MaskOperator::new(MaskStack::random(SHAPE, 0.5, 2).unwrap());
+        let y = h.forward(Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| video(t, i, j)).view());
+        still(&Problem::new(&h, y.view()).unwrap(), 32)
+    }
+
+    #[test]
+    fn a_still_scene_stands_still() {
+        let tiles = tiles(|_, i, j| scene(i as f64, j as f64));
+        assert_eq!(tiles, [true; 6]);
+    }
+
+    #[test]
+    fn a_scene_that_moves_as_a_whole_does_not() {
+        let tiles = tiles(|t, i, j| scene(i as f64, j as f64 + 2.0 * t as f64));
+        assert_eq!(tiles, [false; 6]);
+    }
+
+    #[test]
+    fn something_small_that_moves_wakes_its_tile_only() {
+        let tiles = tiles(|t, i, j| {
+            let on = (36..44).contains(&i) && (68 + 2 * t..76 + 2 * t).contains(&j);
+            if on { 1.0 } else { scene(i as f64, j as f64) }
+        });
+        assert_eq!(tiles, [true, true, true, true, true, false]);
+    }
+}
