@@ -165,8 +165,10 @@ fn a_settled_tile_keeps_its_output_until_its_input_moves() {
 #[test]
 fn a_still_scene_costs_one_frame() {
     let h = operator();
-    let picture = gaussian((1, 96, 128), 3).mapv(|v| 0.5 + 0.1 * v);
-    let truth = picture.broadcast(SHAPE.dim()).unwrap().to_owned();
+    let truth = Array3::from_shape_fn(SHAPE.dim(), |(_, i, j)| {
+        let (i, j) = (i as f32, j as f32);
+        0.5 + 0.15 * (0.9 * i + 0.4 * j).sin() * (0.31 * j).cos() + 0.1 * (i * j / 100.0).sin()
+    });
     let y = h.forward(truth.view());
     let problem = Problem::new(&h, y.view()).unwrap();
     let still = still(&problem, 32);
