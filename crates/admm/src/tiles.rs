@@ -118,11 +118,12 @@ impl<D: Denoiser> Tiles<D> {
     fn needs(&mut self, cx: &DenoiseCx, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
         self.still.resize(grid.len(), None);
         let memory = self.memory.as_ref().filter(|m| m.stage == cx.stage && m.input.dim() == noisy.dim());
-        let config = self.config;
+        let (config, begun) = (self.config, self.memory.is_some());
         let need = |(tile, still): (usize, &mut Option<f64>)| {
             let (rows, columns) = grid.tile(tile);
             let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
-            if let Some(least) = still {
+            // Before the first call nothing has made the frames alike, or unlike.
+            if let (Some(least), true) = (&*still, begun) {
                 let deviation = deviation(now);
                 let awake = deviation > FLOOR.max(*least * config.wake.powi(2));
                 *still = if awake { None } else { Some(least.min(deviation)) };
