@@ -99,7 +99,7 @@ impl Fit {
     }
 
     /// Whether w explains no more of d than of noise.
-    fn is_noise(mut self) -> bool {
+    fn is_noise(&self) -> bool {
         let freedom = self.right.len() - 1;
         if freedom == 0 || self.count < 4 * self.right.len() {
             return false;
@@ -109,8 +109,8 @@ impl Fit {
         if scale <= 0.0 {
             return false;
         }
-        self.normal += scale;
-        let explained = solve(self.normal, &self.right).map_or(f64::INFINITY, |x| x.dot(&self.right));
+        let normal = &self.normal + scale;
+        let explained = solve(normal, &self.right).map_or(f64::INFINITY, |x| x.dot(&self.right));
         let rest = (self.squares - explained).max(0.0) / (self.count - freedom) as f64;
         explained <= LARGEST_F * freedom as f64 * rest || self.squares <= 1e-8 * self.count as f64
     }

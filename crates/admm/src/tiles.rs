@@ -215,8 +215,8 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
         memory.stage = cx.stage;
         for (rows, columns) in of(Need::MeanFrame).into_iter().chain(of(Need::Frames)) {
             let tile = s![.., .., rows, columns];
-            memory.input.slice_mut(tile.clone()).assign(&noisy.slice(tile.clone()));
-            memory.output.slice_mut(tile.clone()).assign(&out.slice(tile));
+            memory.input.slice_mut(tile).assign(&noisy.slice(tile));
+            memory.output.slice_mut(tile).assign(&out.slice(tile));
         }
         self.memory = Some(memory);
         Ok(())

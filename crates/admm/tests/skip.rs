@@ -142,7 +142,7 @@ fn a_tile_wakes_when_no_still_picture_explains_it_any_more() {
     let difference = |k: usize, rows: std::ops::Range<usize>| {
         let (a, b) = (&tiled[k], &whole[k]);
         let tile = s![.., .., rows, 32..64];
-        (&a.slice(tile.clone()) - &b.slice(tile)).iter().fold(0f32, |a, d| a.max(d.abs()))
+        (&a.slice(tile) - &b.slice(tile)).iter().fold(0f32, |a, d| a.max(d.abs()))
     };
     assert!(difference(1, 32..64) > 1e-4, "asleep: one frame for all");
     assert!(difference(2, 32..64) < 1e-6, "awake: {}", difference(2, 32..64));
