@@ -45,6 +45,13 @@ fn gap_ffdnet_fast() {
     beats("gap-ffdnet-fast.toml", "runner40.mat", 32.443, 20);
 }
 
+/// The weights that come with the program, well above what needs none (20.85 and 29.82 dB by TV).
+#[test]
+fn the_default_for_gray_scenes() {
+    beats("default.toml", "traffic48.mat", 23.08, 20);
+    beats("default.toml", "runner40.mat", 31.25, 20);
+}
+
 #[test]
 fn gap_tv_traffic() {
     reaches("gap-tv.toml", "traffic48.mat", 20.764, 0.6873);

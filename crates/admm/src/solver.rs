@@ -1,7 +1,7 @@
 //! The one loop that drives every solver.
 
 use crate::guard::Guard;
-use crate::held_out::{HeldOut, Judge, Verdict};
+use crate::held_out::{Best, HeldOut, Judge, Verdict};
 use crate::{BoxError, DenoiseCx, IterInfo, Observer, Plan, Problem, Start};
 use ndarray::{Array3, Array4, ArrayView3, ArrayView4};
 use sci_forward::Progress;
@@ -205,31 +205,56 @@ pub fn run<S: Solver>(
         }
     }
     clock.resume();
-    if let Some(best) = judge.and_then(Judge::into_best) {
-        let progress = problem.operator().progress(problem.y(), best.estimate.view(), best.estimate.view());
-        relative_residual = relative(progress, problem).0;
-        if !guard.is_result(relative_residual, progress) {
-            stop = StopReason::Diverged;
-        }
-        let (estimate, rgb, seconds) = (best.estimate, best.rgb, clock.elapsed().as_secs_f64());
-        return Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual });
-    }
-    let (estimate, rgb) = match stop {
-        StopReason::Diverged => {
-            let (estimate, residual) = guard.best(solver.previous(&state));
-            relative_residual = residual;
-            (estimate, None)
-        }
-        StopReason::ScheduleDone | StopReason::Converged if !guard.is_result(relative_residual, last) => {
-            stop = StopReason::Diverged;
-            let (estimate, residual) = guard.best(solver.estimate(&state));
-            relative_residual = residual;
-            (estimate, None)
-        }
-        _ => (solver.estimate(&state).to_owned(), solver.rgb(&state).map(|rgb| rgb.to_owned())),
+    let chosen = match judge.and_then(Judge::into_best) {
+        Some(best) => best_held_out(best, problem, &guard, stop),
+        None => last_good(solver, &state, guard, (stop, relative_residual, last)),
     };
+    let Chosen { estimate, rgb, stop, relative_residual } = chosen;
     let seconds = clock.elapsed().as_secs_f64();
     Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual })
+}
+
+/// What a run returns of its iterates, and how it ended after all.
+struct Chosen {
+    estimate: Array3<f32>,
+    rgb: Option<Array4<f32>>,
+    stop: StopReason,
+    relative_residual: f64,
+}
+
+/// The iterate that predicts the held-out pixels best; it must explain the whole measurement.
+fn best_held_out(best: Best, problem: &Problem<'_>, guard: &Guard, stop: StopReason) -> Chosen {
+    let Best { estimate, rgb, .. } = best;
+    let progress = problem.operator().progress(problem.y(), estimate.view(), estimate.view());
+    let relative_residual = relative(progress, problem).0;
+    let stop = if guard.is_result(relative_residual, progress) { stop } else { StopReason::Diverged };
+    Chosen { estimate, rgb, stop, relative_residual }
+}
+
+/// The last iterate; after a divergence, or when a run that ended by itself has no result, the one that explains the
+/// measurement best.
+fn last_good<S: Solver>(
+    solver: &S,
+    state: &S::State,
+    guard: Guard,
+    (stop, relative_residual, last): (StopReason, f64, Progress),
+) -> Chosen {
+    let ended = matches!(stop, StopReason::ScheduleDone | StopReason::Converged);
+    let or = match stop {
+        StopReason::Diverged => Some(solver.previous(state)),
+        _ if ended && !guard.is_result(relative_residual, last) => Some(solver.estimate(state)),
+        _ => None,
+    };
+    match or {
+        Some(or) => {
+            let (estimate, relative_residual) = guard.best(or);
+            Chosen { estimate, rgb: None, stop: StopReason::Diverged, relative_residual }
+        }
+        None => {
+            let rgb = solver.rgb(state).map(|rgb| rgb.to_owned());
+            Chosen { estimate: solver.estimate(state).to_owned(), rgb, stop, relative_residual }
+        }
+    }
 }
 
 /// `‖y − H x‖ / ‖y‖` and `‖x − previous‖ / ‖x‖`; a NaN or an infinity in `x` makes one of them not finite.

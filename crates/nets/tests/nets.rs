@@ -325,3 +325,17 @@ fn a_weight_file_cut_anywhere_is_an_error() {
         }
     }
 }
+
+/// What ships must load, and denoise: a ramp with seeded noise comes out much closer to the ramp.
+#[test]
+fn bundled_weights_denoise() {
+    let clean = Array4::from_shape_fn((2, 1, 48, 48), |(t, _, y, x)| 0.2 + 0.01 * (y + t) as f32 + 0.005 * x as f32);
+    let noise = sci_forward::testing::gaussian(clean.dim(), 7);
+    for name in nets::weights::bundled_names() {
+        let mut net = Ffdnet::load(Path::new(&format!("bundled:{name}"))).unwrap();
+        let noisy = &clean + &(&noise * CX.sigma);
+        let error = |video: &Array4<f32>| (video - &clean).mapv(|v| v * v).mean().unwrap();
+        let (before, after) = (error(&noisy), error(&denoise(&mut net, &noisy)));
+        assert!(after < 0.1 * before, "{name}: {before:e} {after:e}");
+    }
+}

@@ -76,7 +76,7 @@ impl Adam {
             }
         };
         let muon = |w: &mut [f32], m: &mut [f32], g: &[f32], size: [usize; 2]| {
-            let decayed = |m: f32, g: f32| muon::MOMENTUM * m + (1.0 - muon::MOMENTUM) * scale * g;
+            let decayed = |m: f32, g: f32| muon::decayed(m, scale * g);
             m.iter_mut().zip(g).for_each(|(m, &g)| *m = decayed(*m, g));
             let ahead = m.iter().zip(g).map(|(&m, &g)| decayed(m, g)).collect();
             let step = muon::direction(ahead, size);

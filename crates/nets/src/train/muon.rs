@@ -12,12 +12,21 @@
 use ndarray::Array2;
 
 /// Decay of the momentum.
-pub(super) const MOMENTUM: f32 = 0.95;
+const MOMENTUM: f32 = 0.95;
 /// Newton-Schulz iterations of the odd polynomial `a x + b x³ + c x⁵`, which brings singular values to 0.7 to 1.2.
 const ITERATIONS: usize = 5;
 const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
+/// Entries of a momentum of norm 1 below this are nothing: the momentum of a channel that died decays for ever, and
+/// arithmetic with denormal numbers made a step four times as long.
+const NOTHING: f64 = 1e-9;
 /// The fewest channels on either side for which a kernel has directions worth equalising.
 const FEWEST_CHANNELS: usize = 16;
+
+/// The momentum after a gradient; zero instead of a denormal number.
+pub(super) fn decayed(momentum: f32, gradient: f32) -> f32 {
+    let m = MOMENTUM * momentum + (1.0 - MOMENTUM) * gradient;
+    if m.abs() < f32::MIN_POSITIVE { 0.0 } else { m }
+}
 
 /// Rows and columns of a weight that takes such steps.
 pub(super) fn matrix(dims: &[usize]) -> Option<[usize; 2]> {
@@ -39,7 +48,7 @@ pub(super) fn direction(momentum: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<
     if tall {
         x = x.t().as_standard_layout().into_owned();
     }
-    x.mapv_inplace(|v| (f64::from(v) / norm) as f32);
+    x.mapv_inplace(|v| Some(f64::from(v) / norm).filter(|v| v.abs() > NOTHING).unwrap_or(0.0) as f32);
     let [a, b, c] = COEFFICIENTS;
     for _ in 0..ITERATIONS {
         let gram = x.dot(&x.t());
@@ -73,6 +82,16 @@ mod tests {
             assert!(row_sum < 3.0, "{rows}×{columns}: {row_sum}");
         }
         assert_eq!(direction(vec![0.0; 6], [2, 3]), vec![0.0; 6]);
+    }
+
+    #[test]
+    fn a_dead_channel_has_no_direction_and_its_momentum_ends() {
+        let values: Vec<f32> = (0..64).map(|i| if i < 16 { 1e-30 } else { ((i * 29) % 17) as f32 - 8.0 }).collect();
+        let step = direction(values, [4, 16]);
+        assert!(step[..16].iter().all(|&v| v == 0.0) && step[16..].iter().any(|&v| v.abs() > 0.1));
+        let mut m = 1.0;
+        (0..3000).for_each(|_| m = decayed(m, 0.0));
+        assert_eq!(m, 0.0);
     }
 
     #[test]

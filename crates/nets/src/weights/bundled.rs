@@ -1,8 +1,9 @@
-//! Weights that ship inside the crate: one line here for each file in `crates/nets/weights/`.
+//! Weights that ship inside the crate: one line here for each file in `crates/nets/weights/`, beside which a card says how it
+//! was made.
 
 use crate::{Error, Result};
 
-const BUNDLED: &[(&str, &[u8])] = &[];
+const BUNDLED: &[(&str, &[u8])] = &[("ffdnet_gray", include_bytes!("../../weights/ffdnet_gray.safetensors"))];
 
 /// The names that `bundled:NAME` knows.
 pub fn bundled_names() -> Vec<&'static str> {
