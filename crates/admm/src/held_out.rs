@@ -28,9 +28,10 @@ use sci_forward::{SensingOperator, held_in};
 /// | `seed` | 0 | which one | |
 /// | `gain` | 0.03 | least share of E that an iteration takes off | `[0, 1)` |
 /// | `patience` | 3 | iterations to get below the best E of before | ≥ 2 |
-/// | `overshoot` | 1.6 | largest σ in units of `√E` | > 0 |
+/// | `overshoot` | 2.2 | largest σ in units of `√E` | > 0 |
 ///
-/// The defaults were chosen on clips that are in no benchmark.
+/// The defaults were chosen on clips that are in no benchmark. Mean of three of them, gray and color, dB: without it 25.96 and
+/// 25.52 (20 and 15 iterations); overshoot 1.6 26.27 and 25.19, 2.2 26.32 and 25.42, 3 26.09 and 25.46.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HoldOut {
     /// Side of the blocks that give up one pixel each.
@@ -47,7 +48,7 @@ pub struct HoldOut {
 
 impl Default for HoldOut {
     fn default() -> Self {
-        Self { spacing: 12, seed: 0, gain: 0.03, patience: 3, overshoot: 1.6 }
+        Self { spacing: 12, seed: 0, gain: 0.03, patience: 3, overshoot: 2.2 }
     }
 }
 
@@ -246,7 +247,7 @@ mod tests {
         let mut rule = Rule::new(HoldOut::default(), 1.0);
         assert!(!rule.skips(0.5));
         rule.observe(0.01, false);
-        assert!(rule.skips(0.17) && !rule.skips(0.15));
+        assert!(rule.skips(0.23) && !rule.skips(0.21));
     }
 
     #[test]
