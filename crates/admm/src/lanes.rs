@@ -76,6 +76,7 @@ impl Lanes for f32 {
     }
 }
 /// Below it `1/√` would leave the range of `f32`.
+#[cfg(target_arch = "x86_64")]
 const TINY: f32 = 1e-30;
 
 #[derive(Clone, Copy)]
