@@ -5,20 +5,9 @@ use candle_core::{Device, Tensor};
 use ndarray::{Array0, Array4, ArrayD, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
 use nets::{Ends, Fastdvdnet, Ffdnet, Network, WeightFile};
+use sci_forward::testing::shared_file;
 use std::fs::File;
-use std::path::{Path, PathBuf};
-
-/// A file of the shared data, or `None` (and a note) where there is none.
-fn shared(name: &str) -> Option<PathBuf> {
-    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
-    let roots = [std::env::var_os("SCI_DATA").map(PathBuf::from), Some(beside)];
-    let flat = Path::new(name).file_name().expect("tests name files");
-    let found = roots.into_iter().flatten().flat_map(|root| [root.join(name), root.join(flat)]).find(|p| p.exists());
-    if found.is_none() {
-        println!("skipped: {name} is neither in SCI_DATA nor beside the workspace");
-    }
-    found
-}
+use std::path::Path;
 
 struct Golden(NpzReader<File>);
 
@@ -55,7 +44,8 @@ fn assert_close(found: ArrayView4<'_, f32>, expected: ArrayView4<'_, f32>, toler
 
 #[test]
 fn ffdnet_gray_matches_pytorch_even_and_odd() {
-    let (Some(golden), Some(weights)) = (shared("golden/ffdnet_gray.npz"), shared("weights/ffdnet_gray.pth")) else {
+    let (Some(golden), Some(weights)) = (shared_file("golden/ffdnet_gray.npz"), shared_file("weights/ffdnet_gray.pth"))
+    else {
         return;
     };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
@@ -69,7 +59,9 @@ fn ffdnet_gray_matches_pytorch_even_and_odd() {
 
 #[test]
 fn ffdnet_color_matches_pytorch() {
-    let (Some(golden), Some(weights)) = (shared("golden/ffdnet_color.npz"), shared("weights/ffdnet_color.pth")) else {
+    let (Some(golden), Some(weights)) =
+        (shared_file("golden/ffdnet_color.npz"), shared_file("weights/ffdnet_color.pth"))
+    else {
         return;
     };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
@@ -80,7 +72,8 @@ fn ffdnet_color_matches_pytorch() {
 
 #[test]
 fn the_batch_norm_layout_removes_noise_and_folds_exactly() {
-    let (Some(golden), Some(weights)) = (shared("golden/ffdnet_gray.npz"), shared("weights/ffdnet_gray_ipol.pth"))
+    let (Some(golden), Some(weights)) =
+        (shared_file("golden/ffdnet_gray.npz"), shared_file("weights/ffdnet_gray_ipol.pth"))
     else {
         return;
     };
@@ -104,15 +97,15 @@ fn published_files_are_recognised() {
         ("weights/ffdnet_gray_ipol.pth", "FFDNet (gray, 64 channels, 15 layers, batch norm)"),
         ("weights/fastdvdnet_half_color.pth", "FastDVDnet (color, 16/32/64 channels, batch norm)"),
     ] {
-        let Some(path) = shared(name) else { return };
+        let Some(path) = shared_file(name) else { return };
         assert_eq!(WeightFile::read(&path).unwrap().architecture().unwrap().to_string(), what);
     }
 }
 
 #[test]
 fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
-    let weights = shared("weights/fastdvdnet_half_color.pth");
-    let (Some(golden), Some(weights)) = (shared("golden/fastdvdnet_half_color.npz"), weights) else { return };
+    let weights = shared_file("weights/fastdvdnet_half_color.pth");
+    let (Some(golden), Some(weights)) = (shared_file("golden/fastdvdnet_half_color.npz"), weights) else { return };
     let mut net = Fastdvdnet::load(&weights, Ends::Circular).unwrap();
     let mut golden = Golden::open(&golden);
     let (noisy, sigma, expected) = (golden.video("input"), golden.number("sigma"), golden.video("output"));
@@ -127,8 +120,8 @@ fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
 
 #[test]
 fn gradients_of_the_measurement_loss_match_pytorch() {
-    let weights = shared("weights/ffdnet_gray.pth");
-    let (Some(golden), Some(weights)) = (shared("golden/online_gradient_gray.npz"), weights) else { return };
+    let weights = shared_file("weights/ffdnet_gray.pth");
+    let (Some(golden), Some(weights)) = (shared_file("golden/online_gradient_gray.npz"), weights) else { return };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
     let (mask, y, input) = (golden.tensor("mask"), golden.tensor("y"), golden.tensor("input"));
     let vars = net.make_trainable().unwrap();

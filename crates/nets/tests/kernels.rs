@@ -5,7 +5,7 @@ use nets::kernels::{Blocked, Conv3x3, Isa, LANES, PackedConv, Scratch, conv3x3, 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
-use std::path::{Path, PathBuf};
+use sci_forward::testing::shared_file;
 
 /// A convolution to check.
 #[derive(Debug, Clone, Copy)]
@@ -251,25 +251,9 @@ const BOUNDS_64: [(f64, f64); 3] = [(5e-5, 5e-6), (1.2e-5, 1.2e-6), (3.4e-4, 6e-
 const BOUNDS_AMX: [(f64, f64); 3] = [(1.3e-4, 2.7e-5), (3.4e-5, 6.8e-6), (3.4e-4, 6e-5)];
 const BOUNDS_96: [(f64, f64); 3] = [(5.5e-5, 6e-6), (1.4e-5, 1.5e-6), (3.4e-4, 6e-5)];
 
-fn golden() -> Option<PathBuf> {
-    let roots = [
-        std::env::var_os("SCI_DATA").map(PathBuf::from),
-        Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared")),
-    ];
-    let found = roots
-        .into_iter()
-        .flatten()
-        .flat_map(|root| [root.join("golden/conv3x3.npz"), root.join("conv3x3.npz")])
-        .find(|p| p.is_file());
-    if found.is_none() {
-        println!("skipped: no golden/conv3x3.npz in SCI_DATA or ../shared");
-    }
-    found
-}
-
 #[test]
 fn agrees_with_pytorch() -> std::result::Result<(), Box<dyn std::error::Error>> {
-    let Some(path) = golden() else { return Ok(()) };
+    let Some(path) = shared_file("golden/conv3x3.npz") else { return Ok(()) };
     let mut npz = ndarray_npy::NpzReader::new(std::fs::File::open(path)?)?;
     for k in 0..4 {
         let mut array = |name: &str| npz.by_name::<ndarray::OwnedRepr<f32>, ndarray::IxDyn>(&format!("{k}_{name}"));

@@ -8,6 +8,7 @@ use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
     Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, WeightFile,
 };
+use sci_forward::testing::{gaussian, shared_file};
 use sci_forward::{CfaPattern, Demosaicer};
 use std::path::Path;
 
@@ -310,13 +311,8 @@ fn a_weight_file_cut_anywhere_is_an_error() {
     let path = folder.path().join("net.safetensors");
     write_safetensors(&path, &tiny_ffdnet(1).state(), Storage::F32).unwrap();
     let mut files = vec![std::fs::read(&path).unwrap()];
-    let shared = std::env::var_os("SCI_DATA").map_or(Path::new("../../../shared").to_owned(), Into::into);
-    for name in ["ffdnet_gray.pth", "fastdvdnet_half_color.pth"] {
-        match std::fs::read(shared.join("weights").join(name)) {
-            Ok(bytes) => files.push(bytes),
-            Err(_) => println!("{name} skipped: not in SCI_DATA"),
-        }
-    }
+    let published = ["weights/ffdnet_gray.pth", "weights/fastdvdnet_half_color.pth"];
+    files.extend(published.into_iter().filter_map(shared_file).map(|path| std::fs::read(path).unwrap()));
     for bytes in files {
         for part in 0..16 {
             let cut = &bytes[..bytes.len() * part / 16];
@@ -330,7 +326,7 @@ fn a_weight_file_cut_anywhere_is_an_error() {
 #[test]
 fn bundled_weights_denoise() {
     let clean = Array4::from_shape_fn((2, 1, 48, 48), |(t, _, y, x)| 0.2 + 0.01 * (y + t) as f32 + 0.005 * x as f32);
-    let noise = sci_forward::testing::gaussian(clean.dim(), 7);
+    let noise = gaussian(clean.dim(), 7);
     for name in nets::weights::bundled_names() {
         let mut net = Ffdnet::load(Path::new(&format!("bundled:{name}"))).unwrap();
         let noisy = &clean + &(&noise * CX.sigma);

@@ -66,7 +66,8 @@ fn norm<'a>(values: impl Iterator<Item = &'a f32>) -> f64 {
 }
 
 /// A file of the reference data (scenes, weights, golden outputs) that is not part of the repository, named relative to
-/// its folder as in `golden/metrics.npz`; looked for in `$SCI_DATA`, then in `shared` beside the workspace.
+/// its folder as in `golden/metrics.npz`; looked for in `$SCI_DATA`, there also without its folder, then in `shared` beside
+/// the workspace.
 /// Prints why and returns nothing if it is absent, so that a test can skip.
 pub fn shared_file(name: &str) -> Option<PathBuf> {
     let beside_workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
@@ -74,7 +75,8 @@ pub fn shared_file(name: &str) -> Option<PathBuf> {
         .map(PathBuf::from)
         .into_iter()
         .chain([beside_workspace])
-        .map(|folder| folder.join(name))
+        .flat_map(|folder| [Some(folder.join(name)), Path::new(name).file_name().map(|file| folder.join(file))])
+        .flatten()
         .find(|path| path.exists());
     if found.is_none() {
         println!("skipped: {name} is neither in $SCI_DATA nor in ../shared");

@@ -282,7 +282,7 @@ impl TrainConfig {
         check(
             !sigmas.is_empty() && sigmas.iter().all(|&s| level(s)),
             "iterates.sigmas",
-            list(sigmas),
+            format_args!("{sigmas:?}"),
             "each 0 to 255",
         )?;
         let frames = (2..=64).contains(few) && (*few..=64).contains(many);
@@ -306,10 +306,6 @@ impl TrainConfig {
 }
 
 const LEVELS: &str = "two levels from 0 to 255, the lower one first";
-
-fn list(sigmas: &[f32]) -> String {
-    format!("{sigmas:?}")
-}
 
 fn level(sigma: f32) -> bool {
     (0.0..=255.0).contains(&sigma)

@@ -52,25 +52,15 @@ impl Simulated {
         let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: s / 255.0, iterations: 1 }).collect();
         let plan = Plan::new(stages);
         let problem = Problem::new(&self.operator, self.y.view()).map_err(typed)?;
-        let solved = match self.cfa {
-            None => run(&mut Gap::accelerated(denoiser), &problem, Start::Mean, &plan, &mut ()).map_err(typed)?.video(),
+        let outcome = match self.cfa {
+            None => run(&mut Gap::accelerated(denoiser), &problem, Start::Mean, &plan, &mut ()),
             Some(cfa) => {
                 let mut gap = Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa));
-                run(&mut gap, &problem, Start::Mean, &plan, &mut ()).map_err(typed)?.video()
+                run(&mut gap, &problem, Start::Mean, &plan, &mut ())
             }
         };
-        Ok(solved)
-    }
-}
-
-/// What is to be compared with the truth `[T, C, H, W]`.
-trait Video {
-    fn video(self) -> Array4<f32>;
-}
-
-impl<S> Video for admm::Outcome<S> {
-    fn video(self) -> Array4<f32> {
-        self.rgb.unwrap_or_else(|| self.estimate.insert_axis(Axis(1)))
+        let outcome = outcome.map_err(typed)?;
+        Ok(outcome.rgb.unwrap_or_else(|| outcome.estimate.insert_axis(Axis(1))))
     }
 }
 

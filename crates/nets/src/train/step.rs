@@ -96,12 +96,7 @@ impl Model {
     fn restore(&mut self, input: ArrayView4<'_, f32>, sigma: f32) -> Result<Array4<f32>> {
         let mut out = Array4::zeros(input.dim());
         let cx = DenoiseCx { sigma, iteration: 0, stage: 0 };
-        let fail = |e: admm::BoxError| Error::Data(e.to_string());
-        match self {
-            Self::Ffdnet(net) => net.denoise(&cx, input, out.view_mut()).map_err(fail)?,
-            Self::Fastdvdnet(net) => net.denoise(&cx, input, out.view_mut()).map_err(fail)?,
-            Self::Ddnet(net) => net.infer(input, out.view_mut())?,
-        }
+        self.denoise(&cx, input, out.view_mut()).map_err(|e| Error::Data(e.to_string()))?;
         Ok(out)
     }
 }
@@ -187,10 +182,13 @@ impl Denoiser for Model {
         &mut self,
         cx: &DenoiseCx,
         noisy: ArrayView4<'_, f32>,
-        mut out: ArrayViewMut4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), admm::BoxError> {
-        out.assign(&self.restore(noisy, cx.sigma)?);
-        Ok(())
+        match self {
+            Self::Ffdnet(net) => net.denoise(cx, noisy, out),
+            Self::Fastdvdnet(net) => net.denoise(cx, noisy, out),
+            Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
+        }
     }
 }
 
