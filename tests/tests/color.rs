@@ -136,3 +136,21 @@ iterations = 30
         assert_eq!(recon.dim(), video.dim());
     }
 }
+
+/// Without a penalty to speak of, two-stage ADMM diverges: a failure that says what to do and leaves the last good estimate.
+#[test]
+fn divergence_is_a_failure_with_a_result() {
+    let Some(root) = data_root() else { return };
+    let bench = Bench::new();
+    let config = "[data]\npath = 'walk.npz'\nmeasurements = [0]\n[solver]\nkind = 'two-stage'\nrho = 1e-6\n\
+                  [denoiser]\nkind = 'tv'\nweight = 0.1\n[[stage]]\niterations = 12\n";
+    std::fs::write(bench.path("diverges.toml"), config).unwrap();
+    let run = bench.finish(bench.command(&["run", "diverges.toml", "--out", "out"]).env("SCI_DATA", root));
+    assert_eq!(run.code, 1, "{}", run.stdout);
+    for needle in ["measurement 0 diverged in iteration", "raise solver.rho", "1 of 1 measurements diverged"] {
+        assert!(run.stderr.contains(needle), "{needle:?} is not in: {}", run.stderr);
+    }
+    let m = &bench.record("out")["measurements"][0];
+    assert_eq!(m["stop"], "diverged");
+    assert!(m["relative_residual"].is_number() && bench.path("out/recon.npy").is_file());
+}

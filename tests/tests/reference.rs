@@ -72,21 +72,19 @@ fn gap_ffdnet_runner() {
     reaches("gap-ffdnet.toml", "runner40.mat", 32.443, 0.9312);
 }
 
-/// From the reference's start, the bias-only weights diverge; the result must be the last good estimate, marked.
+/// From the reference's start, the bias-only weights diverge with acceleration; the run goes on without it and says so.
 #[test]
-fn divergence_is_a_failure_with_a_result() {
+fn a_diverging_run_goes_on_without_acceleration() {
     let Some(root) = data_root() else { return };
     let bench = Bench::new();
     let mut command = bench.command(&["run", "--out", "out", "--set", "data.measurements=[0]"]);
     command.args(["--set", "denoiser.weights=ffdnet_gray.pth"]).arg(workspace().join("configs/gray/gap-ffdnet.toml"));
     let run = bench.finish(command.env("SCI_DATA", root));
-    assert_eq!(run.code, 1, "{}", run.stdout);
-    for needle in ["measurement 0 diverged in iteration", "solver.start = \"mean\"", "1 of 1 measurements diverged"] {
-        assert!(run.stderr.contains(needle), "{needle:?} is not in: {}", run.stderr);
-    }
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert!(run.stdout.contains("went on without acceleration"), "{}", run.stdout);
     let m = &bench.record("out")["measurements"][0];
-    assert_eq!(m["stop"], "diverged");
-    assert!(m["relative_residual"].is_number() && bench.path("out/recon.npy").is_file());
+    assert_eq!((&m["stop"], &m["backed_off"]["without"]), (&"schedule_done".into(), &"acceleration".into()));
+    assert!(m["psnr_db"].as_f64().unwrap() > 19.0, "{}", m["psnr_db"]);
 }
 
 /// A network for the wrong number of channels is found out before anything is solved.

@@ -6,6 +6,7 @@ mod bench;
 mod pareto;
 mod plot;
 mod repro;
+mod sensitivity;
 mod stress;
 mod tidy;
 mod workspace;
@@ -38,6 +39,8 @@ enum Bench {
     Kernels(bench::Options),
     /// Run time against error: every solver × denoiser over a range of budgets
     Pareto(pareto::Options),
+    /// The paper's figure of parameters: schedules and numbers of online updates
+    Sensitivity(sensitivity::Options),
 }
 
 fn main() -> anyhow::Result<()> {
@@ -50,5 +53,6 @@ fn main() -> anyhow::Result<()> {
         Task::Bench(Bench::GapFfdnet(options)) => bench::solver("gap-ffdnet", &options),
         Task::Bench(Bench::Kernels(options)) => bench::kernels(&options),
         Task::Bench(Bench::Pareto(options)) => pareto::run(&options),
+        Task::Bench(Bench::Sensitivity(options)) => sensitivity::run(&options),
     }
 }

@@ -129,4 +129,12 @@ impl<D: Denoiser> Solver for Gap<D> {
     fn rgb<'s>(&'s self, _: &'s GapState) -> Option<ArrayView4<'s, f32>> {
         self.denoiser.rgb()
     }
+
+    /// Plain GAP cannot leave the measurement: every iteration begins with the projection onto it.
+    fn back_off(&self, problem: &Problem<'_>, state: &mut GapState, good: Array3<f32>) -> Option<&'static str> {
+        state.y1.take()?;
+        state.v = good;
+        state.project(problem);
+        Some("acceleration")
+    }
 }

@@ -46,7 +46,7 @@ pub use prior::{Clipped, DenoiseCx, Denoiser, PerStage};
 pub use problem::{Problem, Start};
 pub use schedule::{Plan, Stage, StopRule};
 pub use sci_forward::BoxError;
-pub use solver::{Outcome, SolveError, Solver, StopReason, run};
+pub use solver::{BackOff, Outcome, SolveError, Solver, StopReason, run};
 pub use still::still;
 pub use tiles::{TileConfig, TileCounts, Tiles};
 pub use tv::Tv;

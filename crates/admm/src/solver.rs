@@ -97,6 +97,21 @@ pub trait Solver {
     fn rgb<'s>(&'s self, _state: &'s Self::State) -> Option<ArrayView4<'s, f32>> {
         None
     }
+
+    /// After a divergence: makes the state ready to go on from `good`, the best iterate so far, with more caution, and says
+    /// what was given up; nothing if there is no more cautious way.
+    fn back_off(&self, _problem: &Problem<'_>, _state: &mut Self::State, _good: Array3<f32>) -> Option<&'static str> {
+        None
+    }
+}
+
+/// A divergence that a solver went on after.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BackOff {
+    /// The iteration that diverged, counted from 0.
+    pub iteration: usize,
+    /// What the solver did without from then on.
+    pub without: &'static str,
 }
 
 /// The result of [`run`].
@@ -111,7 +126,9 @@ pub struct Outcome<S> {
     pub rgb: Option<Array4<f32>>,
     /// Why the run ended.
     pub stop: StopReason,
-    /// Iterations done, the diverged one included.
+    /// The divergence that it went on after, if there was one.
+    pub backed_off: Option<BackOff>,
+    /// Iterations done, diverged ones included.
     pub iterations: usize,
     /// Seconds of solving, the start included, observers not.
     pub seconds: f64,
@@ -119,7 +136,8 @@ pub struct Outcome<S> {
     pub relative_residual: f64,
 }
 
-/// Runs `solver` on `problem` from `start` through the stages of `plan`.
+/// Runs `solver` on `problem` from `start` through the stages of `plan`. After a first divergence it goes on from the best
+/// iterate if the solver knows a more cautious way ([`Solver::back_off`]).
 ///
 /// # Errors
 /// [`SolveError`] for a bad start, or what the denoiser or the observer reports. Divergence is an outcome, not an error.
@@ -148,6 +166,7 @@ pub fn run<S: Solver>(
     let mut iterations = 0;
     let mut spare = 0;
     let mut stop = StopReason::ScheduleDone;
+    let mut backed_off = None;
     let mut last = Progress::default();
     'stages: for (stage, &crate::Stage { sigma, iterations: count }) in plan.stages.iter().enumerate() {
         // What stages of a denoiser with a σ leave over is for those after them.
@@ -170,6 +189,14 @@ pub fn run<S: Solver>(
             let rgb_is_finite = rgb.is_none_or(|rgb| rgb.iter().all(|v| v.is_finite()));
             let (residual, relative_change) = relative(progress, &given);
             if !rgb_is_finite || !guard.admit(residual, relative_change, solver.previous(&state)) {
+                let good = guard.good(solver.previous(&state)).to_owned();
+                let without = backed_off.is_none().then(|| solver.back_off(&given, &mut state, good)).flatten();
+                backed_off = backed_off.or(without.map(|without| BackOff { iteration, without }));
+                if without.is_some() {
+                    relative_residual = guard.residual();
+                    clock.pause();
+                    continue;
+                }
                 stop = StopReason::Diverged;
                 break 'stages;
             }
@@ -211,7 +238,7 @@ pub fn run<S: Solver>(
     };
     let Chosen { estimate, rgb, stop, relative_residual } = chosen;
     let seconds = clock.elapsed().as_secs_f64();
-    Ok(Outcome { state, estimate, rgb, stop, iterations, seconds, relative_residual })
+    Ok(Outcome { state, estimate, rgb, stop, backed_off, iterations, seconds, relative_residual })
 }
 
 /// What a run returns of its iterates, and how it ended after all.

@@ -166,6 +166,26 @@ fn a_denoiser_that_explodes_or_turns_nan_ends_as_diverged_with_the_last_good_est
 }
 
 #[test]
+fn accelerated_gap_goes_on_without_acceleration_after_its_first_divergence() {
+    // Once broken, the accumulated measurement would stay so.
+    let poisoned = |at: usize| {
+        Map(
+            move |cx: &DenoiseCx, x: ArrayView4<'_, f32>| {
+                if cx.iteration % at == at - 1 { x.mapv(|v| v * f32::NAN) } else { x.to_owned() }
+            },
+        )
+    };
+    let once = solve(Gap::accelerated(poisoned(4)), Start::Mean, &stages(7));
+    let expected = Some(BackOff { iteration: 3, without: "acceleration" });
+    assert_eq!((once.stop, once.backed_off, once.iterations), (StopReason::ScheduleDone, expected, 7));
+    assert!(once.estimate.iter().all(|v| v.is_finite()) && once.relative_residual < 1e-5);
+    let twice = solve(Gap::accelerated(poisoned(4)), Start::Mean, &stages(9));
+    assert_eq!((twice.stop, twice.backed_off, twice.iterations), (StopReason::Diverged, expected, 8));
+    let last = solve(Gap::accelerated(poisoned(4)), Start::Mean, &stages(4));
+    assert!(last.backed_off == expected && last.estimate.iter().all(|v| v.is_finite()));
+}
+
+#[test]
 fn a_failing_denoiser_is_named_with_its_iteration() {
     struct Fails;
     impl Denoiser for Fails {

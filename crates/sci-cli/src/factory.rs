@@ -293,8 +293,8 @@ pub struct Solved {
 }
 
 fn without_state<S>(o: Outcome<S>) -> Outcome<()> {
-    let Outcome { estimate, rgb, stop, iterations, seconds, relative_residual, .. } = o;
-    Outcome { state: (), estimate, rgb, stop, iterations, seconds, relative_residual }
+    let Outcome { estimate, rgb, stop, backed_off, iterations, seconds, relative_residual, .. } = o;
+    Outcome { state: (), estimate, rgb, stop, backed_off, iterations, seconds, relative_residual }
 }
 
 fn start<'a>(choice: StartChoice, bayer: bool, previous: Option<ArrayView3<'a, f32>>) -> Start<'a> {

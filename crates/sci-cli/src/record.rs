@@ -65,6 +65,9 @@ pub struct MeasurementRecord {
     pub iterations: usize,
     /// Why the solve ended.
     pub stop: Stop,
+    /// The divergence that it went on after; only where there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub backed_off: Option<BackedOff>,
     /// ‖y − H x‖ / ‖y‖ of the result.
     pub relative_residual: Option<f64>,
     /// Online updates of the denoiser that were kept.
@@ -78,6 +81,21 @@ pub struct MeasurementRecord {
     pub online: Option<Adaptation>,
     /// What happened, iteration by iteration.
     pub trace: Trace,
+}
+
+/// A divergence that the solver went on after, from its best iterate.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BackedOff {
+    /// The iteration that diverged, counted from 0; it has no entry in the trace.
+    pub iteration: usize,
+    /// What the solver did without from then on.
+    pub without: String,
+}
+
+impl From<admm::BackOff> for BackedOff {
+    fn from(b: admm::BackOff) -> Self {
+        Self { iteration: b.iteration, without: b.without.to_owned() }
+    }
 }
 
 /// How the denoiser adapted to a measurement.
@@ -148,6 +166,12 @@ pub struct Trace {
     pub relative_change: Vec<Option<f64>>,
     /// Seconds since the solve began.
     pub seconds: Vec<f64>,
+    /// σ of the iteration, in units of a frame's full scale.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sigma: Vec<f32>,
+    /// The mean square error that held-out pixels predict; empty without `[skip]`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub predicted_error: Vec<Option<f64>>,
 }
 
 /// Means over the measurements of a run.

@@ -180,6 +180,7 @@ fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, tr
         seconds: outcome.seconds,
         iterations: outcome.iterations,
         stop: outcome.stop.into(),
+        backed_off: outcome.backed_off.map(Into::into),
         relative_residual: Some(outcome.relative_residual),
         updates: counts.kept,
         denoiser_calls: work.calls,
@@ -222,12 +223,19 @@ fn line(m: &MeasurementRecord) -> String {
         let cut = if a.cut { ", after a cut" } else { "" };
         format!("   {} of {} updates kept{warm}{cut}", a.counts.kept, a.counts.fired + a.counts.skipped)
     });
-    format!("measurement {:>2}   {quality}   {} iterations   {:.2} s{updates}{note}", m.index, m.iterations, m.seconds)
+    let backed_off = m
+        .backed_off
+        .as_ref()
+        .map_or(String::new(), |b| format!("   diverged in iteration {}, went on without {}", b.iteration, b.without));
+    let (k, iterations, seconds) = (m.index, m.iterations, m.seconds);
+    format!("measurement {k:>2}   {quality}   {iterations} iterations   {seconds:.2} s{updates}{backed_off}{note}")
 }
 
 fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
     use crate::config::check::{Momentum, Solver, Start};
     let suggestion = match (experiment.start, experiment.solver) {
+        // It has already gone on without acceleration.
+        (_, Solver::Gap { .. }) if m.backed_off.is_some() => "raise stage.0.sigma, or use another denoiser",
         (Start::Adjoint, _) => "start from solver.start = \"mean\" (the adjoint is not normalised)",
         (_, Solver::Gap { momentum: Some(Momentum::Zero) }) => "set solver.momentum = \"measurement\"",
         (_, Solver::Gap { momentum: Some(_) }) => "set solver.accelerate = false",
@@ -270,6 +278,10 @@ impl Observer for Watch<'_> {
         self.trace.relative_residual.push(Some(it.relative_residual));
         self.trace.relative_change.push(Some(it.relative_change));
         self.trace.seconds.push(it.seconds);
+        self.trace.sigma.push(it.sigma);
+        if it.predicted_error.is_some() {
+            self.trace.predicted_error.push(it.predicted_error);
+        }
         self.progress.step(it.iteration + 1, psnr_db);
         Ok(if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
     }
