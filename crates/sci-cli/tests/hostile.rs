@@ -146,7 +146,13 @@ fn damaged_files_are_harmless() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.png");
     frames::write_png(&path, ramp.slice(ndarray::s![..1, .., ..])).unwrap();
-    check(".png", &std::fs::read(&path).unwrap(), |b| frames::decode_png(b).is_ok());
+    check(".png", &std::fs::read(&path).unwrap(), |b| frames::decode(b).is_ok());
+    let mut jpeg = Vec::new();
+    image::load_from_memory(&std::fs::read(&path).unwrap())
+        .unwrap()
+        .write_to(&mut Cursor::new(&mut jpeg), image::ImageFormat::Jpeg)
+        .unwrap();
+    check(".jpg", &jpeg, |b| frames::decode(b).is_ok());
 
     let experiment = |b: &[u8]| {
         let text = String::from_utf8_lossy(b);

@@ -11,7 +11,7 @@ use crate::io::scene::{self, Reading};
 /// Arguments of `sci metrics`.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
-    /// The result: .npy, .npz, .mat, .gif, .y4m or a folder of PNGs; color is compared as gray
+    /// The result: .npy, .npz, .mat, .gif, .y4m or a folder of pictures; color is compared as gray
     a: PathBuf,
     /// The truth
     b: PathBuf,

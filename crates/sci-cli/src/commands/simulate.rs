@@ -14,7 +14,7 @@ use crate::simulate::{NoiseModel, simulate};
 /// Arguments of `sci simulate`.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
-    /// The video: .gif, .y4m, a folder of PNGs, .npy, .npz or .mat; color becomes gray without --cfa
+    /// The video: .gif, .y4m, a folder of pictures, .npy, .npz or .mat; color becomes gray without --cfa
     video: PathBuf,
     /// Where to write the scene: .npz or .mat
     #[arg(long, value_name = "FILE")]
@@ -25,7 +25,7 @@ pub(super) struct Args {
     /// How the masks' pixels open
     #[arg(long, value_enum, default_value = "random")]
     mask: Kind,
-    /// Take the masks from a file instead: .npy, .npz, .mat or a folder of PNGs
+    /// Take the masks from a file instead: .npy, .npz, .mat or a folder of pictures
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mask", "frames", "density"])]
     mask_file: Option<PathBuf>,
     /// Frames a measurement sums

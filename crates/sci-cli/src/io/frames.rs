@@ -1,16 +1,17 @@
-//! Owns folders of PNG frames: one file a frame, in the natural order of their names.
+//! Owns folders of PNG or JPEG frames: one file a frame, in the natural order of their names.
 
 use std::fs;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use image::{DynamicImage, ImageBuffer, ImageDecoder, Limits, Luma, Rgb, codecs::png::PngDecoder};
+use image::codecs::{jpeg::JpegDecoder, png::PngDecoder};
+use image::{DynamicImage, ImageBuffer, ImageDecoder, Limits, Luma, Rgb};
 use ndarray::ArrayView3;
 
 use super::samples::{Array, Budget, SampleType, Samples};
-use super::{FileError, ReadError, read_file};
+use super::{FileError, Format, ReadError, read_file};
 
-/// The `.png` files of a folder, `frame2.png` before `frame10.png`.
+/// The `.png`, `.jpg` and `.jpeg` files of a folder, `frame2.png` before `frame10.png`.
 ///
 /// # Errors
 /// The folder's own error, or [`ReadError::NoFrames`] if it holds none.
@@ -19,7 +20,8 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
     let mut paths = Vec::new();
     for entry in fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
-        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
+        let is = |known: &&str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(known));
+        if ["png", "jpg", "jpeg"].iter().any(is) {
             paths.push(path);
         }
     }
@@ -51,7 +53,7 @@ fn natural_key(name: &str) -> Vec<(String, u64)> {
     key
 }
 
-/// Reads a folder of equally large PNGs as a video `[T, C, H, W]`, C = 1 if every frame is gray, else 3.
+/// Reads a folder of equally large pictures as a video `[T, C, H, W]`, C = 1 if every frame is gray, else 3.
 ///
 /// Samples are 0 to 255 for 8-bit files and 0.0 to 1.0 for 16-bit ones; transparency is dropped.
 ///
@@ -61,7 +63,7 @@ pub fn read(folder: &Path) -> Result<Array, FileError> {
     let paths = list(folder)?;
     let mut images = Vec::with_capacity(paths.len());
     for path in &paths {
-        let image = decode_png(&read_file(path)?).map_err(|e| FileError::new(path, e))?;
+        let image = decode(&read_file(path)?).map_err(|e| FileError::new(path, e))?;
         if let Some(first) = images.first().map(|i: &DynamicImage| (i.width(), i.height())) {
             let size = (image.width(), image.height());
             if size != first {
@@ -82,16 +84,23 @@ pub fn read(folder: &Path) -> Result<Array, FileError> {
     to_video(&images).map_err(|e| FileError::new(folder, e))
 }
 
-/// Decodes one PNG, within the budget of its own size.
+/// Decodes one PNG or JPEG, within the budget of its own size.
 ///
 /// # Errors
-/// [`ReadError::Malformed`] for broken bytes or an image too large for its file.
-pub fn decode_png(bytes: &[u8]) -> Result<DynamicImage, ReadError> {
-    let broken = |e: image::ImageError| ReadError::Malformed { format: ".png", reason: e.to_string() };
+/// [`ReadError::Malformed`] for broken bytes, [`ReadError::TooLarge`] for an image too large for its file,
+/// [`ReadError::UnknownFormat`] if it is neither.
+pub fn decode(bytes: &[u8]) -> Result<DynamicImage, ReadError> {
+    let format = Format::of(bytes)?;
+    let broken = |e: image::ImageError| ReadError::Malformed { format: "picture", reason: e.to_string() };
     let mut limits = Limits::default();
     let limit = Budget::for_file(bytes.len()).left();
     limits.max_alloc = Some(limit as u64);
-    let decoder = PngDecoder::with_limits(Cursor::new(bytes), limits).map_err(broken)?;
+    let mut decoder: Box<dyn ImageDecoder> = match format {
+        Format::Png => Box::new(PngDecoder::with_limits(Cursor::new(bytes), limits.clone()).map_err(broken)?),
+        Format::Jpeg => Box::new(JpegDecoder::new(Cursor::new(bytes)).map_err(broken)?),
+        _ => return Err(ReadError::UnknownFormat),
+    };
+    decoder.set_limits(limits).map_err(broken)?;
     let needed = usize::try_from(decoder.total_bytes()).unwrap_or(usize::MAX);
     if needed > limit {
         return Err(ReadError::TooLarge { needed, limit });
@@ -183,6 +192,18 @@ mod tests {
     }
 
     #[test]
+    fn jpegs_are_frames_too() {
+        let dir = tempfile::tempdir().unwrap();
+        for t in [9u8, 10] {
+            let gray = ImageBuffer::from_pixel(16, 8, Luma([10 * t]));
+            gray.save(dir.path().join(format!("f{t}.jpg"))).unwrap();
+        }
+        let video = read(dir.path()).unwrap();
+        assert_eq!(video.shape(), [2, 1, 8, 16]);
+        assert_eq!([0, 128].map(|i| video.samples().at(i)), [90.0, 100.0]);
+    }
+
+    #[test]
     fn an_empty_folder_is_named() {
         let dir = tempfile::tempdir().unwrap();
         let error = read(dir.path()).unwrap_err();
@@ -198,8 +219,8 @@ mod tests {
         for at in 0..bytes.len() {
             let mut b = bytes.clone();
             b[at] ^= 0xff;
-            let _ = decode_png(&b);
-            assert!(decode_png(&bytes[..at]).is_err() || at > bytes.len() - 16);
+            let _ = decode(&b);
+            assert!(decode(&bytes[..at]).is_err() || at > bytes.len() - 16);
         }
     }
 }

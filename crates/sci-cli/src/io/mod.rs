@@ -35,7 +35,9 @@ pub enum ReadError {
         reason: String,
     },
     /// None of the known formats.
-    #[error("unknown format: expected .mat (v5 to v7.3), .npz, .npy, .gif, .y4m, .png or a folder of .png frames")]
+    #[error(
+        "unknown format: expected .mat (v5 to v7.3), .npz, .npy, .gif, .y4m, .png, .jpg or a folder of .png or .jpg frames"
+    )]
     UnknownFormat,
     /// It would unpack to more than the budget.
     #[error(
@@ -57,7 +59,7 @@ pub enum ReadError {
         what: &'static str,
     },
     /// A folder without frames.
-    #[error("folder has no .png frames")]
+    #[error("folder has no .png or .jpg frames")]
     NoFrames,
 }
 
@@ -110,6 +112,8 @@ pub enum Format {
     Y4m,
     /// A single image.
     Png,
+    /// A single image.
+    Jpeg,
 }
 
 impl Format {
@@ -124,6 +128,7 @@ impl Format {
             () if video::is_gif(bytes) => Ok(Self::Gif),
             () if video::is_y4m(bytes) => Ok(Self::Y4m),
             () if bytes.starts_with(b"\x89PNG\r\n\x1a\n") => Ok(Self::Png),
+            () if bytes.starts_with(b"\xff\xd8\xff") => Ok(Self::Jpeg),
             () if mat::is_mat(bytes) => Ok(Self::Mat),
             () => Err(ReadError::UnknownFormat),
         }

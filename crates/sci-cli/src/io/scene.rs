@@ -591,7 +591,7 @@ pub fn read_video(path: &Path, reading: &Reading) -> Result<Array4<f32>, SceneEr
     let read_error = |e| FileError::new(path, e);
     match Format::of(&bytes).map_err(read_error)? {
         Format::Gif | Format::Y4m => frames(super::read_video(&bytes).map_err(read_error)?),
-        Format::Png => Err(SceneError::TooFewFrames { file, frames: 1, needed: 2 }),
+        Format::Png | Format::Jpeg => Err(SceneError::TooFewFrames { file, frames: 1, needed: 2 }),
         Format::Npy => to_channels(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
         Format::Mat | Format::Npz => {
             let keys = &reading.keys;

@@ -8,6 +8,8 @@ use nets::WeightFile;
 use nets::train::{Frame, TrainConfig, TrainData, frame_from_rgb};
 use rayon::prelude::*;
 
+use crate::io;
+
 /// Environment variable with the folder that data is looked up in.
 const DATA_VARIABLE: &str = "SCI_DATA";
 
@@ -75,19 +77,12 @@ fn clips(folder: &Path, channels: usize) -> anyhow::Result<Vec<Vec<Frame>>> {
 
 /// All images of a folder, by name.
 fn frames(folder: &Path, channels: usize) -> anyhow::Result<Vec<Frame>> {
-    let is_image = |path: &PathBuf| {
-        let extension = path.extension().map(|e| e.to_ascii_lowercase());
-        extension.is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|known| e == *known))
-    };
-    let paths: Vec<PathBuf> = entries(folder)?.into_iter().filter(is_image).collect();
-    if paths.is_empty() {
-        bail!("{}: holds no .jpg or .png images", folder.display());
-    }
+    let paths = io::frames::list(folder)?;
     paths.par_iter().map(|path| frame(path, channels).with_context(|| path.display().to_string())).collect()
 }
 
 fn frame(path: &Path, channels: usize) -> anyhow::Result<Frame> {
-    let image = image::ImageReader::open(path)?.with_guessed_format()?.decode()?.into_rgb8();
+    let image = io::frames::decode(&std::fs::read(path)?)?.into_rgb8();
     let (width, height) = (image.width() as usize, image.height() as usize);
     Ok(frame_from_rgb(image.as_raw(), height, width, channels)?)
 }
