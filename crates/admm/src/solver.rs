@@ -136,6 +136,14 @@ pub struct Outcome<S> {
     pub relative_residual: f64,
 }
 
+impl<S> Outcome<S> {
+    /// The same for every solver.
+    pub fn without_state(self) -> Outcome<()> {
+        let Self { estimate, rgb, stop, backed_off, iterations, seconds, relative_residual, .. } = self;
+        Outcome { state: (), estimate, rgb, stop, backed_off, iterations, seconds, relative_residual }
+    }
+}
+
 /// Runs `solver` on `problem` from `start` through the stages of `plan`. After a first divergence it goes on from the best
 /// iterate if the solver knows a more cautious way ([`Solver::back_off`]).
 ///

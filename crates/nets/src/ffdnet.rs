@@ -14,7 +14,7 @@
 
 use crate::infer::{Cache, channel_row, set_channel};
 use crate::kernels::Conv3x3;
-use crate::layers::{Conv, Shift, Source};
+use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
@@ -232,10 +232,8 @@ impl Network for Ffdnet {
         let z = pixel_unshuffle(&Padding::Replicate.pad(clips, 2)?, 2)?;
         let map = noise_map(n, noise, &z)?;
         let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
-        let mut z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
-        for layer in &self.layers {
-            z = layer.forward(&z)?;
-        }
+        let z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
+        let z = chain(&self.layers, &z)?;
         let image = crop(&pixel_shuffle(&z, 2)?, h, w)?;
         Ok(if residual { (clips - image)? } else { image })
     }

@@ -1,6 +1,6 @@
 //! Convolution layers with optional batch norm, and where their tensors come from.
 
-use crate::kernels::{Conv3x3, conv3x3};
+use crate::kernels::{Conv3x3, Link, conv_chain};
 use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
 use rand_chacha::ChaCha8Rng;
@@ -111,11 +111,6 @@ impl Conv {
         Ok((weight, Some(bias)))
     }
 
-    pub(crate) fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let (weight, bias) = self.folded()?;
-        conv3x3(x, &weight, bias.as_ref(), self.opts)
-    }
-
     /// Replaces the batch norm by the equal weight and bias.
     pub(crate) fn fold(&mut self) -> candle_core::Result<()> {
         let (weight, bias) = self.folded()?;
@@ -159,6 +154,12 @@ impl Conv {
         }
         Ok(vars)
     }
+}
+
+/// Layers one after another; differentiable.
+pub(crate) fn chain(convs: &[Conv], x: &Tensor) -> candle_core::Result<Tensor> {
+    let link = |conv: &Conv| conv.folded().map(|(weight, bias)| Link { weight, bias, opts: conv.opts });
+    conv_chain(x, &convs.iter().map(link).collect::<candle_core::Result<Vec<_>>>()?)
 }
 
 /// How a tensor starts when it is not loaded.

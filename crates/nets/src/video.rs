@@ -7,7 +7,7 @@
 use crate::Result;
 use crate::infer::{Cache, Engine, channel_row};
 use crate::kernels::{Blocked, Conv3x3};
-use crate::layers::{Conv, Shift, Source};
+use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Padding, Window, crop, noise_map, reflect};
 use candle_core::Tensor;
 use candle_nn::ops::pixel_shuffle;
@@ -141,13 +141,10 @@ impl Block {
 
     /// `[N, 3(C + 1), H, W]` -> `[N, C, H, W]`, `H` and `W` multiples of 4.
     fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let run = |x: &Tensor, layers: std::ops::Range<usize>| {
-            self.convs[layers].iter().try_fold(x.clone(), |x, conv| conv.forward(&x))
-        };
+        let run = |x: &Tensor, layers: std::ops::Range<usize>| chain(&self.convs[layers], x);
         let full = run(x, 0..2)?;
         let half = run(&full, 2..5)?;
-        let quarter = run(&half, 5..8)?;
-        let half = (half + pixel_shuffle(&run(&quarter, 8..11)?, 2)?)?;
+        let half = (&half + pixel_shuffle(&run(&half, 5..11)?, 2)?)?;
         let full = (full + pixel_shuffle(&run(&half, 11..14)?, 2)?)?;
         run(&full, 14..16)
     }

@@ -191,16 +191,7 @@ fn solve<N: Network + Denoiser>(
     plan: &Plan,
 ) -> Result<Solve<()>, SolveError> {
     let problem = Problem::new(snapshot.operator().as_ref(), snapshot.y())?;
-    let o = run(&mut Gap::plain(denoiser), &problem, start, plan, &mut ())?;
-    Ok(Solve {
-        state: (),
-        estimate: o.estimate,
-        rgb: o.rgb,
-        stop: o.stop,
-        iterations: o.iterations,
-        seconds: o.seconds,
-        relative_residual: o.relative_residual,
-    })
+    Ok(run(&mut Gap::plain(denoiser), &problem, start, plan, &mut ())?.without_state())
 }
 
 fn sequence(videos: &[Array3<f32>], config: SequenceConfig) -> (AdaptiveDenoiser<Ffdnet>, Vec<Solved<()>>) {

@@ -159,7 +159,7 @@ impl<'e> Factory<'e> {
         let mut outcome = match (self.experiment.solver, color) {
             (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
                 let mut solver = TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params);
-                without_state(admm::run(&mut solver, problem, start, plan, observer)?)
+                admm::run(&mut solver, problem, start, plan, observer)?.without_state()
             }
             (Solver::Gap { momentum }, _) => {
                 let gap = match momentum {
@@ -168,11 +168,11 @@ impl<'e> Factory<'e> {
                     Some(Momentum::Measurement) => Gap::with_momentum(denoiser, MomentumStart::Measurement),
                 };
                 let mut gap = if self.experiment.skip.is_some() { gap.restarting() } else { gap };
-                without_state(admm::run(&mut gap, problem, start, plan, observer)?)
+                admm::run(&mut gap, problem, start, plan, observer)?.without_state()
             }
             (Solver::Admm { gamma }, _) => {
                 let mut solver = Admm::new(denoiser, gamma);
-                without_state(admm::run(&mut solver, problem, start, plan, observer)?)
+                admm::run(&mut solver, problem, start, plan, observer)?.without_state()
             }
             (Solver::TwoStage { .. }, None) => unreachable!("Factory::new refuses two-stage solvers for gray scenes"),
         };
@@ -290,11 +290,6 @@ pub struct Solved {
     pub work: Work,
     /// How the denoiser adapted, where it was to.
     pub adaptation: Option<Adaptation>,
-}
-
-fn without_state<S>(o: Outcome<S>) -> Outcome<()> {
-    let Outcome { estimate, rgb, stop, backed_off, iterations, seconds, relative_residual, .. } = o;
-    Outcome { state: (), estimate, rgb, stop, backed_off, iterations, seconds, relative_residual }
 }
 
 fn start<'a>(choice: StartChoice, bayer: bool, previous: Option<ArrayView3<'a, f32>>) -> Start<'a> {

@@ -81,6 +81,11 @@ impl Blocked {
         (self.channels, self.height, self.width)
     }
 
+    /// Memory of its pixels.
+    pub(super) fn bytes(&self) -> usize {
+        self.data.len() * size_of::<Pixel>()
+    }
+
     /// Number of channel blocks, `⌈C/16⌉`.
     pub fn blocks(&self) -> usize {
         match self.form {

@@ -2,8 +2,8 @@
 
 #[cfg(target_arch = "x86_64")]
 use super::amx;
-use super::blocked::{Blocked, Form, Pixel, Planes, SLACK, View, ViewMut, ZERO, padded, unpack};
-use super::scratch::{Scratch, Slot, band};
+use super::blocked::{Blocked, Form, Pixel, SLACK, View, ViewMut, ZERO, padded};
+use super::scratch::{Scratch, Slot};
 use super::simd::{Isa, LANES};
 use super::{KernelError, Step, Strip, Weights, direct, winograd};
 
@@ -139,13 +139,29 @@ impl PackedConv {
     /// [`KernelError::Channels`] or [`KernelError::Empty`].
     pub fn forward(&self, input: &Blocked, output: &mut Blocked, scratch: &mut Scratch) -> Result<(), KernelError> {
         let (_, height, width) = input.shape();
-        let (out_h, out_w) = (self.step.out_size(height), self.step.out_size(width));
+        let (_, out_h, out_w) = self.out_shape(height, width);
+        self.forward_to((out_h, out_w), input, output, scratch)
+    }
+
+    /// As [`PackedConv::forward`], to a result of this height and width, at most one less than its own.
+    pub(super) fn forward_to(
+        &self,
+        size: (usize, usize),
+        input: &Blocked,
+        output: &mut Blocked,
+        scratch: &mut Scratch,
+    ) -> Result<(), KernelError> {
         self.check_image(input)?;
-        output.reform(self.form, self.outputs, out_h, out_w);
+        output.reform(self.form, self.outputs, size.0, size.1);
         let dst = output.view_mut().inner();
         // SAFETY: strips write disjoint rows of the output.
-        unsafe { self.strips(input, Store::As(self.form), |y| dst.down(y), scratch) }
+        unsafe { self.strips(size, input, Store::As(self.form), |y| dst.down(y), scratch) }
         Ok(())
+    }
+
+    /// Channels, height and width of the result for an image of this height and width.
+    pub(super) fn out_shape(&self, height: usize, width: usize) -> (usize, usize, usize) {
+        (self.outputs, self.step.out_size(height), self.step.out_size(width))
     }
 
     /// Adds the pixel-shuffled result to a split image of twice the size: phase `2i + j` of the outputs to the pixels
@@ -173,7 +189,7 @@ impl PackedConv {
         );
         let dst = image.view_mut().inner();
         // SAFETY: strips write disjoint rows of the image.
-        unsafe { self.strips(input, Store::AddShuffled, |y| dst.down(2 * y), scratch) }
+        unsafe { self.strips((height, width), input, Store::AddShuffled, |y| dst.down(2 * y), scratch) }
         Ok(())
     }
 
@@ -181,13 +197,13 @@ impl PackedConv {
     /// `dst(y)` must be where output row `y` can be written.
     unsafe fn strips(
         &self,
+        (out_h, out_w): (usize, usize),
         input: &Blocked,
         store: Store,
         dst: impl Fn(usize) -> ViewMut + Sync,
         scratch: &mut Scratch,
     ) {
-        let (_, height, width) = input.shape();
-        let (out_h, out_w) = (self.step.out_size(height), self.step.out_size(width));
+        let (_, _, width) = input.shape();
         let (src, each) = (input.view(), strip_rows(out_w));
         scratch.each(out_h.div_ceil(each), |i, slot| {
             let y = i * each;
@@ -220,61 +236,6 @@ impl PackedConv {
         if shape.contains(&0) {
             return Err(KernelError::Empty(shape));
         }
-        Ok(())
-    }
-
-    /// Convolves a batch of planes `[N,Cin,H,W]` to `[N,Cout,out_h,out_w]`.
-    ///
-    /// # Safety
-    /// `output` must have room for the result; all of it is written.
-    pub(super) unsafe fn forward_planes(
-        &self,
-        input: &[f32],
-        shape: [usize; 4],
-        output: *mut f32,
-        (out_h, out_w): (usize, usize),
-        scratch: &mut Scratch,
-    ) -> Result<(), KernelError> {
-        let [n, channels, height, width] = shape;
-        self.check(channels, shape)?;
-        super::blocked::check_len(n * channels * height * width, input.len())?;
-        let each = strip_rows(out_w);
-        let strips = out_h.div_ceil(each);
-        let output = SendPtr(output);
-        scratch.each(n * strips, |job, slot| {
-            let (image, y) = (job / strips, job % strips * each);
-            let rows = each.min(out_h - y);
-            let planes = Planes {
-                ptr: input[image * channels * height * width..].as_ptr(),
-                plane: height * width,
-                channels,
-                height,
-                width,
-            };
-            // SAFETY: `planes` is image `image` of the checked input; the strip's output rows are its own.
-            unsafe {
-                let first = self.step.first_row(y);
-                let read = self.step.input_rows(rows);
-                let src = band(self.isa, planes, 1, first, read, padded(width), &mut slot.src);
-                if self.input_form() == Form::Split {
-                    let dst = ViewMut { ptr: slot.src.as_mut_ptr(), block: src.block, row: src.row };
-                    split(src, channels, read * padded(width), dst);
-                }
-                let blocks = self.outputs.div_ceil(LANES);
-                slot.dst.grow(blocks * rows * out_w * LANES);
-                let dst = ViewMut { ptr: slot.dst.as_mut_ptr(), block: rows * out_w * LANES, row: out_w * LANES };
-                self.strip(Strip { src, dst, rows, width: out_w }, Store::As(Form::Single), slot);
-                let plane = out_h * out_w;
-                let result = Planes {
-                    ptr: output.at(image * self.outputs * plane + y * out_w),
-                    plane,
-                    channels: self.outputs,
-                    height: rows,
-                    width: out_w,
-                };
-                unpack(self.isa, dst.shared(), result);
-            }
-        });
         Ok(())
     }
 
@@ -357,22 +318,4 @@ unsafe fn split(src: View, channels: usize, count: usize, dst: ViewMut) {
 pub(super) fn strip_rows(width: usize) -> usize {
     const TILES: usize = 64;
     winograd::TILE * (TILES / width.div_ceil(winograd::TILE)).max(1)
-}
-
-/// An address that workers write disjoint parts of.
-#[derive(Clone, Copy)]
-pub(super) struct SendPtr(pub(super) *mut f32);
-
-// SAFETY: the users write disjoint parts.
-unsafe impl Send for SendPtr {}
-// SAFETY: as above.
-unsafe impl Sync for SendPtr {}
-
-impl SendPtr {
-    /// # Safety
-    /// `offset` must stay inside the allocation.
-    pub(super) unsafe fn at(self, offset: usize) -> *mut f32 {
-        // SAFETY: the caller's contract.
-        unsafe { self.0.add(offset) }
-    }
 }

@@ -1,13 +1,13 @@
 //! 3×3 convolutions with zero padding 1, f32 on the CPU: the part of the program where nearly all time goes.
 //!
-//! Two ways in. [`conv3x3`] is a candle operation with gradients, planes `[N,C,H,W]` in and out: training and
-//! adaptation use it. [`PackedConv`] is a layer whose filters are packed once and which maps one [`Blocked`] image to
-//! another without allocating: inference chains these.
+//! Two ways in. [`conv_chain`] (and [`conv3x3`], a chain of one) is a candle operation with gradients, planes `[N,C,H,W]` in and
+//! out: training and adaptation use it. [`PackedConv`] is a layer whose filters are packed once and which maps one [`Blocked`]
+//! image to another without allocating: inference chains these, and so does a [`conv_chain`] inside, forward and back.
 //!
 //! # How it works
 //!
 //! * Layout: channels in blocks of 16, one block of one pixel a cache line, a border of zeros around the image
-//!   ([`Blocked`]). Planes are copied to that layout a strip at a time, where they stay in the second-level cache.
+//!   ([`Blocked`]).
 //! * Where the processor has AMX, inference does convolutions of more than 16 channels by the definition on its matrix
 //!   unit (`amx`), each number as the sum of two bf16 ones. Images between the layers of a network stay in that form. The
 //!   error is five times that of AVX-512 (below); 40 iterations of GAP-FFDNet on *traffic* end 2e-5 dB apart.
@@ -38,6 +38,11 @@
 //! | F(2×2, 3×3), 64 tiles at a time   | 398 · 407 · 215 · 341   | 302 · 335 · 221 · 287   | 256 · 281 · 119 · 206   |
 //! | direct                            | 218 · 205 · 221 · 222   | 191 · 201 · 182 · 203   | 165 · 181 · 136 · 182   |
 //!
+//! The last two columns are of a [`conv3x3`] that copied planes to blocks a strip at a time. As a chain of one it copies whole
+//! images, and loses: two threads, in turn, forward 688 · 766 · 473 · 730 → 586 · 671 · 359 · 685, both 500 · 589 · 331 · 548 →
+//! 432 · 519 · 272 · 491. But a network pays for the copies once, and the automatic differentiation no longer fills an image with
+//! zeros to add a gradient to it: a training step (in turn, ms) of FFDNet went from 113 to 94, of FastDVDnet from 810 to 705.
+//!
 //! * Tiles transformed at a time: 16 lose 15 to 25 %, 48 lose 5 %, 64 more; 32 stay. Strips of 32, 64 or 128 tiles are
 //!   within the noise of each other.
 //! * Winograd against direct by channels (in → out, 128², time ratio): 3→32 1.46, 4→64 1.03, 5→64 0.89, 8→64 0.63,
@@ -64,7 +69,7 @@
 //! * FastDVDnet has 2.6 times the products of FFDNet and takes 3.2 times as long. Its features at full size are 25 MB a
 //!   frame, more than the second-level cache holds: 80 % of the time goes into the unit's loop, at 60 % of its speed
 //!   (FFDNet 75 %); 6 % into splitting the first layer's results, 4 % into computing them.
-//! * Training gains nothing: a step of FFDNet takes 121 to 137 ms, 120 to 123 by AVX-512.
+//! * Training gains little: a step of FFDNet takes 88 ms, 95 by AVX-512; of FastDVDnet 695 to 699, 704. Gradients stay exact.
 //! * Not tried: the first two layers of FastDVDnet in bands of rows, without the image between them; its noise map as a
 //!   bias (at most 2 %); whole frames in parallel; AMX for the weight gradient.
 //!
@@ -97,7 +102,7 @@ mod winograd;
 pub use blocked::Blocked;
 pub use conv::PackedConv;
 pub use memory::keep_freed_memory;
-pub use op::{Conv3x3, conv3x3, conv3x3_on};
+pub use op::{Conv3x3, Link, conv_chain, conv3x3, conv3x3_on};
 pub use peak::gemm_peak;
 pub use scratch::Scratch;
 pub use simd::{Isa, LANES};
@@ -187,15 +192,6 @@ impl Step {
             Self::Same => y,
             Self::Half => 2 * y,
             Self::Double => y / 2,
-        }
-    }
-
-    /// Rows of the padded input that `rows` output rows read.
-    fn input_rows(self, rows: usize) -> usize {
-        match self {
-            // whole Winograd tiles
-            Self::Same => rows.next_multiple_of(winograd::TILE) + 2,
-            Self::Half | Self::Double => self.first_row(rows - 1) + 3,
         }
     }
 }

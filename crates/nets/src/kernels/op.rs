@@ -1,12 +1,20 @@
 //! The kernels as differentiable candle operations.
+//!
+//! A chain of convolutions is one operation: its images stay in the blocked layout from layer to layer, forward and back, and
+//! the automatic differentiation around it sees a single node.
 
+use super::blocked::Blocked;
 use super::conv::PackedConv;
-use super::grad::{Operands, weight_grad};
-use super::scratch::Scratch;
+use super::grad::{bias_grad, weight_grad};
+use super::scratch::{IMAGES, Scratch};
 use super::simd::Isa;
 use super::{KernelError, Step, Weights};
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Device, Error, Layout, Result, Shape, Storage, Tensor};
+use candle_core::{CpuStorage, CustomOp2, DType, Device, Error, Layout, Result, Shape, Storage, Tensor};
 use rayon::prelude::*;
+use std::sync::{Mutex, PoisonError};
+
+/// Of what knows nothing of candle.
+type Checked<T> = std::result::Result<T, KernelError>;
 
 /// How a 3×3 convolution is done; the padding is always one zero on each side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,6 +31,34 @@ impl Default for Conv3x3 {
     /// Stride 1, one group, no ReLU.
     fn default() -> Self {
         Self { stride: 1, groups: 1, relu: false }
+    }
+}
+
+/// A layer of a [`conv_chain`].
+#[derive(Debug, Clone)]
+pub struct Link {
+    /// `[Cout,Cin/groups,3,3]`.
+    pub weight: Tensor,
+    /// `[Cout]`.
+    pub bias: Option<Tensor>,
+    /// How it is done.
+    pub opts: Conv3x3,
+}
+
+impl Link {
+    fn tensors(&self) -> impl Iterator<Item = &Tensor> {
+        std::iter::once(&self.weight).chain(&self.bias)
+    }
+
+    /// On candle's own operations.
+    fn by_candle(&self, x: &Tensor) -> Result<Tensor> {
+        let Conv3x3 { stride, groups, relu } = self.opts;
+        let y = x.conv2d(&self.weight, 1, stride, 1, groups)?;
+        let y = match &self.bias {
+            Some(b) => y.broadcast_add(&b.reshape((1, (), 1, 1))?)?,
+            None => y,
+        };
+        if relu { y.relu() } else { Ok(y) }
     }
 }
 
@@ -45,16 +81,7 @@ impl Default for Conv3x3 {
 /// When the shapes do not fit together, the stride is neither 1 nor 2, a shape has a zero, or `SCI_KERNEL` asks for an
 /// instruction set that this machine lacks.
 pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
-    let ours = |t: &Tensor| t.device().is_cpu() && t.dtype() == DType::F32;
-    if ours(x) && ours(w) && bias.is_none_or(ours) {
-        return conv3x3_on(Isa::detect_for_gradients().map_err(Error::wrap)?, x, w, bias, opts);
-    }
-    let y = x.conv2d(w, 1, opts.stride, 1, opts.groups)?;
-    let y = match bias {
-        Some(b) => y.broadcast_add(&b.reshape((1, (), 1, 1))?)?,
-        None => y,
-    };
-    if opts.relu { y.relu() } else { Ok(y) }
+    conv_chain(x, &[Link { weight: w.clone(), bias: bias.cloned(), opts }])
 }
 
 /// As [`conv3x3`], for f32 on the CPU and a given instruction set.
@@ -62,19 +89,202 @@ pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> 
 /// # Errors
 /// As [`conv3x3`], when a tensor is not f32 on the CPU, and when this machine lacks the instruction set.
 pub fn conv3x3_on(isa: Isa, x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
-    let isa = isa.checked().map_err(Error::wrap)?;
-    let op = Op { isa, opts };
-    let (x, w) = (x.contiguous()?, w.contiguous()?);
-    match bias {
-        Some(b) => x.apply_op3(&w, &b.contiguous()?, op),
-        None => x.apply_op2(&w, op),
+    Chain::run(isa, x, &[Link { weight: w.clone(), bias: bias.cloned(), opts }])
+}
+
+/// Convolutions one after another, each as [`conv3x3`]; differentiable in the input and in all weights and biases. Until the
+/// result is dropped, what every layer was given is kept for the way back, if any gradient is asked for.
+///
+/// ```
+/// use candle_core::{DType, Device, Tensor};
+/// use nets::kernels::{Conv3x3, Link, conv_chain};
+/// let weight = Tensor::ones((1, 1, 3, 3), DType::F32, &Device::Cpu)?;
+/// let link = Link { weight, bias: None, opts: Conv3x3 { stride: 2, ..Conv3x3::default() } };
+/// let x = Tensor::ones((1, 1, 4, 4), DType::F32, &Device::Cpu)?;
+/// assert_eq!(conv_chain(&x, &[link.clone(), link])?.flatten_all()?.to_vec1::<f32>()?, [25.]);
+/// # Ok::<(), candle_core::Error>(())
+/// ```
+///
+/// # Errors
+/// As [`conv3x3`].
+pub fn conv_chain(x: &Tensor, links: &[Link]) -> Result<Tensor> {
+    let ours = |t: &Tensor| t.device().is_cpu() && t.dtype() == DType::F32;
+    if !links.is_empty() && ours(x) && links.iter().flat_map(Link::tensors).all(ours) {
+        return Chain::run(Isa::detect_for_gradients().map_err(Error::wrap)?, x, links);
+    }
+    links.iter().try_fold(x.clone(), |x, link| link.by_candle(&x))
+}
+
+/// A layer as the operation sees it.
+#[derive(Debug)]
+struct Layer {
+    opts: Conv3x3,
+    inputs: usize,
+    outputs: usize,
+    /// Where its weights begin among the parameters; its biases follow.
+    at: usize,
+    biases: usize,
+    /// Whether a gradient by weights, or by biases, is asked for.
+    wants: (bool, bool),
+}
+
+impl Layer {
+    fn weights<'p>(&self, params: &'p [f32]) -> &'p [f32] {
+        &params[self.at..][..self.outputs * (self.inputs / self.opts.groups) * 9]
+    }
+
+    fn step(&self) -> Checked<Step> {
+        Step::of_stride(self.opts.stride)
+    }
+
+    fn packed(&self, isa: Isa, params: &[f32]) -> Checked<PackedConv> {
+        let weights = self.weights(params);
+        let bias = &params[self.at + weights.len()..][..self.biases];
+        let bias = (self.biases > 0).then_some(bias);
+        PackedConv::new_on(isa, weights, bias, self.inputs, self.outputs, self.opts)
+    }
+
+    /// The gradient by the input, as a convolution of the gradient by the result.
+    fn adjoint(&self, isa: Isa, params: &[f32]) -> Checked<PackedConv> {
+        let weights = Weights::new(self.weights(params), self.inputs, self.outputs, self.opts.groups)?;
+        let step = if self.step()? == Step::Half { Step::Double } else { Step::Same };
+        Ok(PackedConv::pack(isa, &weights.adjoint(), step))
+    }
+
+    /// Writes the gradients that are wanted to their places among those of all parameters.
+    fn parameter_grads(&self, isa: Isa, x: &[&Blocked], grads: &[Blocked], all: &mut [f32]) -> Checked<()> {
+        let own = &mut all[self.at..];
+        let bias = match self.wants {
+            (true, _) => {
+                let shape = (self.inputs, self.outputs, self.opts.groups);
+                let (dw, db) = Scratch::lend(|scratch| weight_grad(isa, x, grads, shape, self.step()?, scratch))?;
+                own[..dw.len()].copy_from_slice(&dw);
+                db
+            }
+            (false, true) => bias_grad(grads, self.outputs),
+            (false, false) => return Ok(()),
+        };
+        let weights = self.outputs * (self.inputs / self.opts.groups) * 9;
+        own[weights..][..self.biases].copy_from_slice(&bias[..self.biases]);
+        Ok(())
     }
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Op {
+/// The layers, with what the way back needs of the way there.
+#[derive(Debug)]
+struct Chain {
     isa: Isa,
-    opts: Conv3x3,
+    layers: Vec<Layer>,
+    wants_input_grad: bool,
+    /// Of each image: what goes into each layer, and the result if the last layer has a ReLU.
+    kept: Mutex<Vec<Vec<Blocked>>>,
+}
+
+impl Chain {
+    fn run(isa: Isa, x: &Tensor, links: &[Link]) -> Result<Tensor> {
+        let isa = isa.checked().map_err(Error::wrap)?;
+        let (_, mut channels, ..) = x.dims4()?;
+        let (mut layers, mut at) = (Vec::new(), 0);
+        for Link { weight, bias, opts } in links {
+            let outputs = filter_channels(weight.dims4()?, channels, opts.groups)?;
+            let biases = bias.as_ref().map_or(0, |b| b.elem_count());
+            if bias.is_some() && biases != outputs {
+                candle_core::bail!("conv3x3: {biases} biases for {outputs} channels");
+            }
+            let wants = (weight.track_op(), bias.as_ref().is_some_and(|b| b.track_op()));
+            layers.push(Layer { opts: *opts, inputs: channels, outputs, at, biases, wants });
+            at += weight.elem_count() + biases;
+            channels = outputs;
+        }
+        let flat = links.iter().flat_map(Link::tensors).map(|t| t.flatten_all()).collect::<Result<Vec<_>>>()?;
+        let chain = Self { isa, layers, wants_input_grad: x.track_op(), kept: Mutex::default() };
+        x.contiguous()?.apply_op2(&Tensor::cat(&flat, 0)?, chain)
+    }
+
+    /// The first layer that the gradient has to reach, if there is one.
+    fn first_wanted(&self) -> Option<usize> {
+        if self.wants_input_grad { Some(0) } else { self.layers.iter().position(|l| l.wants.0 || l.wants.1) }
+    }
+
+    /// One image `[C,H,W]` through all layers; what is to be kept of it.
+    fn image(&self, convs: &[PackedConv], x: &[f32], [c, h, w]: [usize; 3], y: &mut [f32]) -> Checked<Vec<Blocked>> {
+        let (keep, mut kept) = (self.first_wanted().is_some(), Vec::new());
+        let mut image = IMAGES.take((c, h, w));
+        image.read_planes(c, h, w, x)?;
+        Scratch::lend(|scratch| {
+            for conv in convs {
+                let (_, h, w) = image.shape();
+                let mut next = IMAGES.take(conv.out_shape(h, w));
+                conv.forward(&image, &mut next, scratch)?;
+                let before = std::mem::replace(&mut image, next);
+                if keep { kept.push(before) } else { IMAGES.give([before]) }
+            }
+            Checked::Ok(())
+        })?;
+        image.write_planes(y)?;
+        if keep && self.layers.last().is_some_and(|l| l.opts.relu) {
+            kept.push(image);
+        } else {
+            IMAGES.give([image]);
+        }
+        Ok(kept)
+    }
+
+    /// From the gradients by the result of each image: those by its input if they are wanted, and those by the parameters.
+    fn back(&self, params: &[f32], mut grads: Vec<Blocked>) -> Checked<(Vec<Blocked>, Vec<f32>)> {
+        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = vec![0.0; params.len()];
+        let first = self.first_wanted().unwrap_or(self.layers.len());
+        for (i, layer) in self.layers.iter().enumerate().skip(first).rev() {
+            if layer.opts.relu {
+                grads.par_iter_mut().zip(&*kept).for_each(|(grad, kept)| mask(grad, &kept[i + 1]));
+            }
+            let inputs: Vec<&Blocked> = kept.iter().map(|kept| &kept[i]).collect();
+            layer.parameter_grads(self.isa, &inputs, &grads, &mut all)?;
+            if i > first || self.wants_input_grad {
+                let conv = layer.adjoint(self.isa, params)?;
+                grads.par_iter_mut().zip(inputs).try_for_each(|(grad, input)| {
+                    let (channels, height, width) = input.shape();
+                    let mut dx = IMAGES.take((channels, height, width));
+                    Scratch::lend(|scratch| conv.forward_to((height, width), grad, &mut dx, scratch))?;
+                    IMAGES.give([std::mem::replace(grad, dx)]);
+                    Checked::Ok(())
+                })?;
+            }
+        }
+        Ok((grads, all))
+    }
+}
+
+impl Drop for Chain {
+    fn drop(&mut self) {
+        let kept = self.kept.get_mut().unwrap_or_else(PoisonError::into_inner);
+        IMAGES.give(kept.drain(..).flatten());
+    }
+}
+
+/// Lets a gradient through where the ReLU let its value through.
+fn mask(grad: &mut Blocked, y: &Blocked) {
+    let (_, height, _) = y.shape();
+    for block in 0..y.blocks() {
+        for row in 0..height {
+            for (g, &y) in grad.row_mut(block, row).iter_mut().zip(y.row(block, row)) {
+                *g = if y <= 0.0 { 0.0 } else { *g };
+            }
+        }
+    }
+}
+
+/// `Cout` of filters `[Cout, Cin/groups, 3, 3]`, checked against an input's channels.
+fn filter_channels(filters: (usize, usize, usize, usize), channels: usize, groups: usize) -> Result<usize> {
+    let (outputs, each, kh, kw) = filters;
+    if (kh, kw) != (3, 3) || each * groups != channels {
+        candle_core::bail!(
+            "conv3x3: filters {filters:?} on {channels} channels in {groups} groups; they must be \
+             [Cout, Cin/groups, 3, 3]"
+        )
+    }
+    Ok(outputs)
 }
 
 /// The numbers of a contiguous tensor.
@@ -95,121 +305,29 @@ fn with_numbers<R>(t: &Tensor, f: impl FnOnce(&[f32]) -> Result<R>) -> Result<R>
     }
 }
 
-/// `[Cout, Cin]` of filters `[Cout, Cin/groups, 3, 3]`, checked against an input's channels.
-fn filter_channels(filters: (usize, usize, usize, usize), channels: usize, groups: usize) -> Result<usize> {
-    let (outputs, each, kh, kw) = filters;
-    if (kh, kw) != (3, 3) || each * groups != channels {
-        candle_core::bail!(
-            "conv3x3: filters {filters:?} on {channels} channels in {groups} groups; they must be \
-             [Cout, Cin/groups, 3, 3]"
-        )
-    }
-    Ok(outputs)
+/// Planes `[N,C,H,W]` as images.
+fn blocked(planes: &[f32], [_, c, h, w]: [usize; 4]) -> Result<Vec<Blocked>> {
+    let image = |planes: &[f32]| {
+        let mut image = IMAGES.take((c, h, w));
+        image.read_planes(c, h, w, planes).map(|()| image)
+    };
+    planes.par_chunks_exact(c * h * w).map(image).collect::<Checked<_>>().map_err(Error::wrap)
 }
 
-/// Runs a packed convolution on planes.
-fn run(conv: &PackedConv, x: &[f32], shape: [usize; 4], out: (usize, usize)) -> Result<Vec<f32>> {
-    let len = shape[0] * conv.channels().1 * out.0 * out.1;
-    let mut y = Vec::with_capacity(len);
-    Scratch::lend(|scratch| {
-        // SAFETY: `y` has room for the result, all of which is written before it becomes its content.
-        unsafe {
-            conv.forward_planes(x, shape, y.as_mut_ptr(), out, scratch)?;
-            y.set_len(len);
-        }
-        Ok::<_, KernelError>(())
-    })
-    .map_err(Error::wrap)?;
-    Ok(y)
+/// Images as planes `[N,C,H,W]`.
+fn planes(images: &[Blocked], shape: [usize; 4]) -> Result<Tensor> {
+    let mut all = vec![0.0; shape.iter().product()];
+    let each = shape[1] * shape[2] * shape[3];
+    let write = |(image, planes): (&Blocked, &mut [f32])| image.write_planes(planes);
+    images.par_iter().zip(all.par_chunks_exact_mut(each)).try_for_each(write).map_err(Error::wrap)?;
+    Tensor::from_vec(all, &shape, &Device::Cpu)
 }
 
-impl Op {
-    fn step(&self) -> Result<Step> {
-        Step::of_stride(self.opts.stride).map_err(Error::wrap)
-    }
-
-    fn forward(
-        &self,
-        x: (&CpuStorage, &Layout),
-        w: (&CpuStorage, &Layout),
-        bias: Option<&[f32]>,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (n, channels, height, width) = x.1.shape().dims4()?;
-        let outputs = filter_channels(w.1.shape().dims4()?, channels, self.opts.groups)?;
-        let step = self.step()?;
-        let out = (step.out_size(height), step.out_size(width));
-        let weights = numbers(w.0, w.1)?;
-        let conv = PackedConv::new_on(self.isa, weights, bias, channels, outputs, self.opts).map_err(Error::wrap)?;
-        let y = run(&conv, numbers(x.0, x.1)?, [n, channels, height, width], out)?;
-        Ok((CpuStorage::F32(y), (n, outputs, out.0, out.1).into()))
-    }
-
-    /// The gradient before the ReLU, which lets through what it let through before.
-    fn unmask(&self, y: &Tensor, grad: &Tensor) -> Result<Tensor> {
-        if !self.opts.relu {
-            return grad.contiguous();
-        }
-        let masked = with_numbers(y, |y| {
-            with_numbers(grad, |g| {
-                let mut out = Vec::with_capacity(g.len());
-                y.par_iter()
-                    .zip(g)
-                    .with_min_len(1 << 14)
-                    .map(|(&y, &g)| if y <= 0.0 { 0.0 } else { g })
-                    .collect_into_vec(&mut out);
-                Ok(out)
-            })
-        })?;
-        Tensor::from_vec(masked, grad.shape(), &Device::Cpu)
-    }
-
-    fn input_grad(&self, x: &Tensor, w: &Tensor, grad: &Tensor) -> Result<Tensor> {
-        let (n, channels, height, width) = x.dims4()?;
-        let (_, outputs, out_h, out_w) = grad.dims4()?;
-        let step = match self.step()? {
-            Step::Half => Step::Double,
-            other => other,
-        };
-        let conv = with_numbers(w, |w| {
-            let weights = Weights::new(w, channels, outputs, self.opts.groups).map_err(Error::wrap)?;
-            Ok(PackedConv::pack(self.isa, &weights.adjoint(), step))
-        })?;
-        let dx = with_numbers(grad, |g| run(&conv, g, [n, outputs, out_h, out_w], (height, width)))?;
-        Tensor::from_vec(dx, (n, channels, height, width), &Device::Cpu)
-    }
-
-    /// By the bias alone: sums over frames and pixels, in f64 in a fixed order.
-    fn bias_grad(grad: &Tensor) -> Result<Tensor> {
-        let (n, outputs, height, width) = grad.dims4()?;
-        let db = with_numbers(grad, |g| {
-            let plane = height * width;
-            let sum = |o: usize| -> f64 {
-                (0..n).flat_map(|i| &g[(i * outputs + o) * plane..][..plane]).map(|&v| f64::from(v)).sum()
-            };
-            Ok((0..outputs).into_par_iter().map(|o| sum(o) as f32).collect::<Vec<_>>())
-        })?;
-        Tensor::from_vec(db, outputs, &Device::Cpu)
-    }
-
-    /// By weight and bias.
-    fn weight_grad(&self, x: &Tensor, w: &Tensor, grad: &Tensor) -> Result<(Tensor, Tensor)> {
-        let (n, channels, height, width) = x.dims4()?;
-        let outputs = w.dim(0)?;
-        let step = self.step()?;
-        let (dw, db) = with_numbers(x, |x| {
-            with_numbers(grad, |g| {
-                Scratch::lend(|scratch| {
-                    let operands = Operands { input: x, shape: [n, channels, height, width], grad: g, outputs };
-                    weight_grad(self.isa, &operands, step, self.opts.groups, scratch)
-                })
-                .map_err(Error::wrap)
-            })
-        })?;
-        Ok((Tensor::from_vec(dw, w.shape(), &Device::Cpu)?, Tensor::from_vec(db, outputs, &Device::Cpu)?))
-    }
+fn dims(t: &Tensor) -> Result<[usize; 4]> {
+    t.dims4().map(|(n, c, h, w)| [n, c, h, w])
 }
 
-impl CustomOp2 for Op {
+impl CustomOp2 for Chain {
     fn name(&self) -> &'static str {
         "conv3x3"
     }
@@ -218,52 +336,32 @@ impl CustomOp2 for Op {
         &self,
         x: &CpuStorage,
         x_layout: &Layout,
-        w: &CpuStorage,
-        w_layout: &Layout,
+        params: &CpuStorage,
+        params_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        self.forward((x, x_layout), (w, w_layout), None)
+        let (n, c, h, w) = x_layout.shape().dims4()?;
+        if [n, c, h, w].contains(&0) {
+            return Err(Error::wrap(KernelError::Empty([n, c, h, w])));
+        }
+        let (x, params) = (numbers(x, x_layout)?, numbers(params, params_layout)?);
+        let layers = self.layers.iter();
+        let convs: Vec<_> =
+            layers.map(|layer| layer.packed(self.isa, params)).collect::<Checked<_>>().map_err(Error::wrap)?;
+        let shape = convs.iter().fold((c, h, w), |(_, h, w), conv| conv.out_shape(h, w));
+        let each = shape.0 * shape.1 * shape.2;
+        let mut y = vec![0.0; n * each];
+        let images = x.par_chunks_exact(c * h * w).zip(y.par_chunks_exact_mut(each));
+        let kept = images.map(|(x, y)| self.image(&convs, x, [c, h, w], y)).collect::<Checked<_>>();
+        *self.kept.lock().unwrap_or_else(PoisonError::into_inner) = kept.map_err(Error::wrap)?;
+        Ok((CpuStorage::F32(y), (n, shape.0, shape.1, shape.2).into()))
     }
 
-    fn bwd(&self, x: &Tensor, w: &Tensor, y: &Tensor, grad: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let grad = self.unmask(y, grad)?;
-        let dx = x.track_op().then(|| self.input_grad(x, w, &grad));
-        let dw = w.track_op().then(|| self.weight_grad(x, w, &grad));
-        Ok((dx.transpose()?, dw.transpose()?.map(|(dw, _)| dw)))
-    }
-}
-
-impl CustomOp3 for Op {
-    fn name(&self) -> &'static str {
-        "conv3x3"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        w: &CpuStorage,
-        w_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        self.forward((x, x_layout), (w, w_layout), Some(numbers(b, b_layout)?))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        w: &Tensor,
-        b: &Tensor,
-        y: &Tensor,
-        grad: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad = self.unmask(y, grad)?;
-        let dx = x.track_op().then(|| self.input_grad(x, w, &grad));
-        let (dw, db) = match (w.track_op(), b.track_op()) {
-            (true, _) => self.weight_grad(x, w, &grad).map(|(dw, db)| (Some(dw), Some(db)))?,
-            (false, true) => (None, Some(Self::bias_grad(&grad)?)),
-            (false, false) => (None, None),
-        };
-        Ok((dx.transpose()?, dw, db))
+    fn bwd(&self, x: &Tensor, params: &Tensor, _: &Tensor, grad: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let grads = with_numbers(grad, |g| blocked(g, dims(grad)?))?;
+        let back = |params: &[f32]| self.back(params, grads).map_err(Error::wrap);
+        let (images, all) = with_numbers(params, back)?;
+        let dx = self.wants_input_grad.then(|| planes(&images, dims(x)?)).transpose()?;
+        IMAGES.give(images);
+        Ok((dx, params.track_op().then(|| Tensor::new(all, &Device::Cpu)).transpose()?))
     }
 }

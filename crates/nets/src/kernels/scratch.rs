@@ -1,11 +1,11 @@
 //! Memory that calls reuse, and how work is shared out.
 
-use super::blocked::{Pixel, Planes, SLACK, View, ViewMut, ZERO, pack};
-use super::simd::{Isa, LANES};
+use super::blocked::{Blocked, Pixel, ZERO};
+use super::simd::LANES;
 use super::tile::Run;
 use rayon::prelude::*;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 /// Working memory of the kernels. Keep one for a sequence of calls: it grows to what the largest needs, and then no
 /// call allocates. Holds about 1 MB per thread at 64 channels.
@@ -79,7 +79,7 @@ impl Scratch {
     /// Lends a scratch from a process-wide store, for callers that have nowhere to keep one.
     pub(super) fn lend<R>(f: impl FnOnce(&mut Self) -> R) -> R {
         static STORE: Mutex<Vec<Scratch>> = Mutex::new(Vec::new());
-        let store = || STORE.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let store = || STORE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = store().pop().unwrap_or_default();
         let result = f(&mut scratch);
         store().push(scratch);
@@ -87,45 +87,36 @@ impl Scratch {
     }
 }
 
-/// Copies rows `first - top..` of an image to blocks with a border of zeros: `rows` rows in all, `padded_width` wide.
-///
-/// # Safety
-/// The image must be readable and `isa` available.
-pub(super) unsafe fn band(
-    isa: Isa,
-    image: Planes<*const f32>,
-    top: usize,
-    first: usize,
-    rows: usize,
-    padded_width: usize,
-    buffer: &mut Buffer,
-) -> View {
-    let line = padded_width * LANES;
-    let block = rows * line;
-    let blocks = image.channels.div_ceil(LANES);
-    // room to split the numbers where they are
-    buffer.grow(blocks.next_multiple_of(2) * block + SLACK * LANES);
-    let pixels = &mut buffer.pixels()[..blocks * rows * padded_width];
-    // rows of the band that the image has
-    let from = top.saturating_sub(first).min(rows);
-    let to = (image.height + top).saturating_sub(first).min(rows).max(from);
-    for plane in pixels.chunks_exact_mut(rows * padded_width) {
-        plane[..from * padded_width].fill(ZERO);
-        plane[to * padded_width..].fill(ZERO);
-        for row in plane[from * padded_width..to * padded_width].chunks_exact_mut(padded_width) {
-            row[0] = ZERO;
-            row[1 + image.width..].fill(ZERO);
+/// Images of earlier calls: their borders are zero already, and their memory is at hand.
+pub(super) struct Images {
+    free: Mutex<Vec<Blocked>>,
+}
+
+/// The images that the process keeps.
+pub(super) static IMAGES: Images = Images { free: Mutex::new(Vec::new()) };
+
+/// Bytes of them at most.
+const MOST_KEPT: usize = 1 << 30;
+
+impl Images {
+    /// An image whose border is zero and whose pixels are unspecified.
+    pub(super) fn take(&self, shape: (usize, usize, usize)) -> Blocked {
+        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        // The last are the likeliest to be in a cache.
+        let found = free.iter().rposition(|image| image.shape() == shape).map(|i| free.swap_remove(i));
+        drop(free);
+        found.unwrap_or_else(|| Blocked::zeros(shape.0, shape.1, shape.2))
+    }
+
+    /// Takes images back.
+    pub(super) fn give(&self, images: impl IntoIterator<Item = Blocked>) {
+        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut bytes: usize = free.iter().map(Blocked::bytes).sum();
+        for image in images {
+            bytes += image.bytes();
+            if bytes <= MOST_KEPT {
+                free.push(image);
+            }
         }
     }
-    let ptr = buffer.as_mut_ptr();
-    // SAFETY: rows from..to lie in the image and in the band.
-    unsafe {
-        let rows = Planes {
-            ptr: image.ptr.wrapping_add((first + from).wrapping_sub(top).wrapping_mul(image.width)),
-            height: to - from,
-            ..image
-        };
-        pack(isa, rows, ViewMut { ptr: ptr.add(from * line + LANES), block, row: line });
-    }
-    View { ptr, block, row: line }
 }
