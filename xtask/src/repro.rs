@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Deserialize;
 
-use crate::workspace::{built_sci, root, sci_run, shared};
+use crate::workspace::{built_sci, results_dir, root, sci_run, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -16,6 +16,9 @@ pub(crate) struct Options {
     /// Fail if a cell with an expected value is off it by more than configs/expected.toml tolerates
     #[arg(long)]
     check: bool,
+    /// Keep the table in xtask/results/<cpu>/
+    #[arg(long)]
+    save: bool,
     /// Folder with data/ and weights/ [default: $SCI_DATA, else ../shared beside the repository]
     #[arg(long, value_name = "DIR")]
     shared: Option<PathBuf>,
@@ -91,8 +94,14 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let shared = shared(options.shared.as_deref())?;
     let sci = built_sci()?;
     let mut off = Vec::new();
-    println!("| algorithm | scene | published | ours | difference | SSIM, published | seconds a measurement |");
-    println!("|---|---|---|---|---|---|---|");
+    let mut kept = String::new();
+    // Rows take minutes: each is printed when it is there.
+    let mut tell = |line: String| {
+        println!("{line}");
+        kept += &(line + "\n");
+    };
+    tell("| algorithm | scene | published | ours | difference | SSIM, published | seconds a measurement |".into());
+    tell("|---|---|---|---|---|---|---|".into());
     for row in &table.row {
         for (i, scene) in table.scenes.iter().enumerate() {
             let published =
@@ -100,12 +109,10 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
             let ssim = row.published_ssim.get(i).map_or("–".to_owned(), |s| format!("{s:.3}"));
             let named = format!("| {} | {} | {published:.2}", row.name, scene.name);
             match cell(&sci, &shared, row, scene)? {
-                Err(lacking) => println!("{named} | {lacking} | – | – ({ssim}) | – |"),
+                Err(lacking) => tell(format!("{named} | {lacking} | – | – ({ssim}) | – |")),
                 Ok(Ours { psnr_db, ssim: own, seconds }) => {
-                    println!(
-                        "{named} | {psnr_db:.2} | {:+.2} | {own:.3} ({ssim}) | {seconds:.2} |",
-                        psnr_db - published
-                    );
+                    let off_by = psnr_db - published;
+                    tell(format!("{named} | {psnr_db:.2} | {off_by:+.2} | {own:.3} ({ssim}) | {seconds:.2} |"));
                     let tolerance = &expected.tolerance;
                     let Some([psnr, ssim]) = row.expected.get(&scene.name) else { continue };
                     if (psnr_db - psnr).abs() > tolerance.psnr_db || (own - ssim).abs() > tolerance.ssim {
@@ -117,6 +124,10 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
                 }
             }
         }
+    }
+    if options.save {
+        let name = if options.table == Which::TableGray { "repro-gray.md" } else { "repro-color.md" };
+        fs::write(results_dir()?.join(name), kept)?;
     }
     off.iter().for_each(|o| eprintln!("off: {o}"));
     ensure!(!options.check || off.is_empty(), "{} cells are off", off.len());

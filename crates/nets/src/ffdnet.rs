@@ -243,6 +243,11 @@ impl Network for Ffdnet {
         vec![(0..frames).map(|t| Window { inputs: vec![t], outputs: t..t + 1 }).collect()]
     }
 
+    /// One pixel of the half-size images in each layer, and the other pixel of a pair.
+    fn reach(&self) -> Option<usize> {
+        Some(2 * self.spec.depth + 2)
+    }
+
     fn convs(&self) -> Vec<&Conv> {
         self.layers.iter().collect()
     }

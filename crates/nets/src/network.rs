@@ -53,6 +53,13 @@ pub trait Network: Send + Sync {
         self.forward(inputs, &[noise])
     }
 
+    /// How many rows away a row of a frame can change a row of the result, rounded up to a multiple of what
+    /// [`Network::padded`] continues frames to, so that a strip cut out with as many rows around it has the same result;
+    /// nothing where strips are not worth it.
+    fn reach(&self) -> Option<usize> {
+        None
+    }
+
     /// Frames `[T, C, H, W]` continued to the size that [`Network::forward_window`] takes.
     ///
     /// # Errors

@@ -7,7 +7,7 @@
 //!
 //! A network of several stages (FastDVDnet) takes as many passes, the last stage first: what arrives at the results of
 //! a stage is what the stage before propagates. The memory is that of one triplet through one block, half a window of
-//! five frames, besides one video for each stage.
+//! five frames, besides one video for each stage. Frames of FFDNet, which reaches few rows, are taken a strip at a time.
 
 use crate::{Error, Result};
 use candle_core::{DType, Tensor, Var};
@@ -17,6 +17,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sci_forward::bayer::{CfaPattern, mosaic_adjoint_into, mosaic_into};
 use sci_forward::{SensingOperator, VideoShape};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// A measurement and what made it: `y = H T v`, `T` the mosaic of a color sensor or the identity of a gray one.
@@ -244,8 +245,8 @@ impl Pixels {
 /// Adds to `sums` the gradient of `⟨upstream, f(input)⟩` by each of `vars`: with `upstream = ∂ℓ/∂v`, the gradient of ℓ.
 ///
 /// `input` and `upstream` are `[T, C, H, W]`, `f` is `network` told `sigma`; `sums[i]` has the values of `vars[i]`.
-/// Activations are those of one window ([`Network::stages`]); windows are summed in their order. A window whose upstream is
-/// zero costs nothing.
+/// Activations are those of one window ([`Network::stages`]), or of a strip of it where the network knows its reach; both are
+/// summed in their order. One whose upstream is zero costs nothing.
 ///
 /// # Errors
 /// [`Error::Net`] as [`Network::forward`].
@@ -293,19 +294,23 @@ fn propagate(
     upstream: &Tensor,
     sums: &mut [Vec<f32>],
 ) -> Result<Tensor> {
+    let (_, _, height, _) = read.dims4()?;
     let frame = read.elem_count() / read.dim(0)?;
     let mut below = vec![0f32; if stage == 0 { 0 } else { read.elem_count() }];
-    for window in windows {
+    let strips = strips(network.reach().filter(|_| stage == 0), height);
+    for (window, Strip { rows, around }) in windows.iter().flat_map(|w| strips.iter().map(move |s| (w, s))) {
         let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
+        let upstream = upstream.narrow(2, rows.start, rows.len())?;
         if values(&upstream)?.iter().all(|&v| v == 0.0) {
             continue;
         }
-        let mut inputs = gather(read, window)?;
+        let mut inputs = gather(read, window)?.narrow(2, around.start, around.len())?;
         let leaf = (stage > 0).then(|| Var::from_tensor(&inputs)).transpose()?;
         if let Some(leaf) = &leaf {
             inputs = leaf.as_tensor().clone();
         }
         let result = network.forward_window(stage, &inputs, sigma)?;
+        let result = result.narrow(2, rows.start - around.start, rows.len())?;
         let grads = (result * upstream)?.sum_all()?.backward()?;
         for ((_, var), sum) in vars.iter().zip(&mut *sums) {
             if let Some(grad) = grads.get(var) {
@@ -324,6 +329,33 @@ fn propagate(
     }
 }
 
+/// Rows of a strip: the more, the less is computed twice; the fewer, the less memory.
+const STRIP: usize = 192;
+
+/// Rows whose results are looked at, and those around them that they depend on.
+struct Strip {
+    rows: Range<usize>,
+    around: Range<usize>,
+}
+
+/// Strips of frames of a network of that reach, all with as many rows around, so that they use the same memory in turn; one
+/// of all rows where there is no reach, or little to save.
+fn strips(reach: Option<usize>, height: usize) -> Vec<Strip> {
+    let (count, reach) = match reach {
+        Some(reach) if height >= 2 * STRIP => (height / STRIP, reach),
+        _ => (1, 0),
+    };
+    // Even, as cut frames have to be.
+    let each = height.div_ceil(count).next_multiple_of(2);
+    let tall = (each + 2 * reach).min(height);
+    let strip = |i: usize| {
+        let rows = i * each..((i + 1) * each).min(height);
+        let first = rows.start.saturating_sub(reach).min((height - tall).next_multiple_of(2));
+        Strip { rows, around: first..(first + tall).min(height) }
+    };
+    (0..height.div_ceil(each)).map(strip).collect()
+}
+
 fn gather(from: &Tensor, window: &Window) -> Result<Tensor> {
     let frames = window.inputs.iter().map(|&t| from.narrow(0, t, 1)).collect::<candle_core::Result<Vec<_>>>()?;
     Ok(Tensor::cat(&frames, 0)?)
@@ -336,4 +368,28 @@ fn values(tensor: &Tensor) -> Result<Vec<f32>> {
 fn add(sum: &mut [f32], terms: &[f32]) {
     assert_eq!(sum.len(), terms.len(), "a gradient has the size of its variable");
     sum.iter_mut().zip(terms).for_each(|(s, t)| *s += t);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn strips_cover_all_rows_once_with_their_reach_around_them() {
+        for height in [1, 2, 255, 256, 257, 301, 512, 1000, 9001] {
+            for reach in [None, Some(10), Some(32)] {
+                let strips = strips(reach, height);
+                let mut next = 0;
+                for Strip { rows, around } in &strips {
+                    assert_eq!((rows.start, around.start % 2), (next, 0), "{height}");
+                    let reach = reach.filter(|_| strips.len() > 1).unwrap_or(0);
+                    assert!(around.start <= rows.start.saturating_sub(reach), "{height}");
+                    assert!(around.end >= (rows.end + reach).min(height) && around.end <= height, "{height}");
+                    assert!(reach == 0 || around.len() <= 2 * STRIP + 2 * reach, "{height}: {around:?}");
+                    next = rows.end;
+                }
+                assert_eq!(next, height);
+            }
+        }
+    }
 }

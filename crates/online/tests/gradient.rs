@@ -105,6 +105,17 @@ fn ffdnet_in_both_layouts_equals_the_whole_graph() {
     }
 }
 
+/// Frames so tall that they are taken in strips, the last one higher than the others.
+#[test]
+fn tall_frames_in_strips_equal_the_whole_graph() {
+    if delegated("tall_frames_in_strips_equal_the_whole_graph") {
+        return;
+    }
+    let spec = FfdnetSpec { channels: 1, width: 8, depth: 4, layout: FfdnetLayout::Direct };
+    let tall = VideoShape { frames: 2, height: 401, width: 10 };
+    assert_equals_whole_graph(Ffdnet::random(spec, 4).unwrap(), tall, Parameters::All);
+}
+
 #[test]
 fn fastdvdnet_in_windows_equals_the_whole_graph() {
     if delegated("fastdvdnet_in_windows_equals_the_whole_graph") {
