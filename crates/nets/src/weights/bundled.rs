@@ -3,7 +3,11 @@
 
 use crate::{Error, Result};
 
-const BUNDLED: &[(&str, &[u8])] = &[("ffdnet_gray", include_bytes!("../../weights/ffdnet_gray.safetensors"))];
+macro_rules! bundled {
+    ($($name:literal),*) => { &[$(($name, include_bytes!(concat!("../../weights/", $name, ".safetensors")))),*] };
+}
+
+const BUNDLED: &[(&str, &[u8])] = bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci"];
 
 /// The names that `bundled:NAME` knows.
 pub fn bundled_names() -> Vec<&'static str> {
