@@ -332,7 +332,7 @@ fn bundled_weights_denoise() {
             Architecture::Fastdvdnet(_) => {
                 lowers_the_noise(name, &mut Fastdvdnet::load(&path, Ends::Circular).unwrap())
             }
-            Architecture::Ddnet(_) => unreachable!("{name}: a demosaicer is bundled that no test looks at"),
+            other => unreachable!("{name}: no test looks at a bundled {other}"),
         }
     }
 }
