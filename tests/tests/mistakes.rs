@@ -270,9 +270,9 @@ fn values_that_are_not_finite() {
 fn an_empty_folder() {
     let bench = bench();
     std::fs::create_dir(bench.path("empty")).unwrap();
-    fails(&bench, &["--set", "data.path=empty"], 1, &["data.path", "empty", "no .png frames"]);
+    fails(&bench, &["--set", "data.path=empty"], 1, &["data.path", "empty", "no .png or .jpg frames"]);
     let simulate = ["--set", "data.path=empty", "--set", "data.kind=simulate", "--set", "data.mask={kind=\"random\"}"];
-    fails(&bench, &simulate, 1, &["data.path", "empty", "no .png frames"]);
+    fails(&bench, &simulate, 1, &["data.path", "empty", "no .png or .jpg frames"]);
 }
 
 #[test]
