@@ -52,19 +52,9 @@ impl Guard {
         !self.iterated || (residual <= 1.0 && progress.norm.sqrt() <= TOO_BRIGHT * self.level)
     }
 
-    /// The best iterate; `last` is the last that was not found to have diverged.
-    pub(crate) fn good<'a>(&'a self, last: ArrayView3<'a, f32>) -> ArrayView3<'a, f32> {
-        self.kept.as_ref().map_or(last, |kept| kept.view())
-    }
-
-    /// The relative residual of the best iterate, of the start before the first.
-    pub(crate) fn residual(&self) -> f64 {
-        self.best
-    }
-
     /// The best iterate with its residual; `last` is the last that was not found to have diverged.
-    pub(crate) fn best(self, last: ArrayView3<'_, f32>) -> (Array3<f32>, f64) {
-        (self.kept.unwrap_or_else(|| last.to_owned()), self.best)
+    pub(crate) fn best(&self, last: ArrayView3<'_, f32>) -> (Array3<f32>, f64) {
+        (self.kept.as_ref().map_or(last, |kept| kept.view()).to_owned(), self.best)
     }
 }
 

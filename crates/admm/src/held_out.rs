@@ -32,9 +32,9 @@ use sci_forward::{SensingOperator, held_in};
 ///
 /// The defaults were chosen on clips that are in no benchmark. Mean of three of them, gray and color, dB: without it 25.96 and
 /// 25.52 (20 and 15 iterations); overshoot 1.6 26.27 and 25.19, 2.2 26.32 and 25.42, 3 26.09 and 25.46 (gain 0.03). Gain in
-/// gray: 0.03 26.32 after 23 iterations, 0.015 26.37 after 27, 0 26.38 after 34; looked at again because the benchmark's runner lost
-/// 0.4 dB with 0.03. No gain: σ = 2 √E or 3 √E in each iteration
-/// instead of stages (25.66, 24.89), and extrapolation v + β (v − v₋) inside stages (β = 0.3, 0.6, 1: 26.32, 26.26, 26.14).
+/// gray: 0.03 26.32 after 23 iterations, 0.015 26.37 after 27, 0 26.38 after 34; looked at again because the benchmark's runner
+/// lost 0.4 dB with 0.03. No gain: σ = 2 √E or 3 √E in each iteration instead of stages (25.66, 24.89), and extrapolation
+/// v + β (v − v₋) inside stages (β = 0.3, 0.6, 1: 26.32, 26.26, 26.14).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HoldOut {
     /// Side of the blocks that give up one pixel each.

@@ -197,11 +197,11 @@ pub fn run<S: Solver>(
             let rgb_is_finite = rgb.is_none_or(|rgb| rgb.iter().all(|v| v.is_finite()));
             let (residual, relative_change) = relative(progress, &given);
             if !rgb_is_finite || !guard.admit(residual, relative_change, solver.previous(&state)) {
-                let good = guard.good(solver.previous(&state)).to_owned();
+                let (good, good_residual) = guard.best(solver.previous(&state));
                 let without = backed_off.is_none().then(|| solver.back_off(&given, &mut state, good)).flatten();
                 backed_off = backed_off.or(without.map(|without| BackOff { iteration, without }));
                 if without.is_some() {
-                    relative_residual = guard.residual();
+                    relative_residual = good_residual;
                     clock.pause();
                     continue;
                 }
@@ -242,7 +242,7 @@ pub fn run<S: Solver>(
     clock.resume();
     let chosen = match judge.and_then(Judge::into_best) {
         Some(best) => best_held_out(best, problem, &guard, stop),
-        None => last_good(solver, &state, guard, (stop, relative_residual, last)),
+        None => last_good(solver, &state, &guard, (stop, relative_residual, last)),
     };
     let Chosen { estimate, rgb, stop, relative_residual } = chosen;
     let seconds = clock.elapsed().as_secs_f64();
@@ -271,7 +271,7 @@ fn best_held_out(best: Best, problem: &Problem<'_>, guard: &Guard, stop: StopRea
 fn last_good<S: Solver>(
     solver: &S,
     state: &S::State,
-    guard: Guard,
+    guard: &Guard,
     (stop, relative_residual, last): (StopReason, f64, Progress),
 ) -> Chosen {
     let ended = matches!(stop, StopReason::ScheduleDone | StopReason::Converged);
