@@ -95,8 +95,14 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.noise = None;
     config.data.frames = 1;
     config.data.batch = 1;
-    config.iterates =
-        Some(IteratesConfig { sigmas: vec![50.0, 25.0, 12.0], frames: [2, 4], density: [0.3, 0.7], gray_masks: 0.5 });
+    config.iterates = Some(IteratesConfig {
+        sigmas: vec![50.0, 25.0, 12.0],
+        calls: 2,
+        start_iterations: 2,
+        frames: [2, 4],
+        density: [0.3, 0.7],
+        gray_masks: 0.5,
+    });
     config
 }
 
@@ -151,6 +157,9 @@ fn noise_or_iterates_but_not_both() {
     assert_eq!(key(|c| c.iterates = None), "noise");
     assert_eq!(key(|c| c.network = DDNET), "iterates");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().sigmas.clear()), "iterates.sigmas");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().start_iterations = 1001), "iterates.start_iterations");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().calls = 0), "iterates.calls");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().calls = 4), "iterates.calls");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().frames = [1, 4]), "iterates.frames");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().density = [0.5, 0.3]), "iterates.density");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().gray_masks = f64::NAN), "iterates.gray_masks");

@@ -2,7 +2,6 @@
 
 use super::muon;
 use crate::Result;
-use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use rayon::prelude::*;
 
@@ -39,18 +38,9 @@ impl Adam {
         self
     }
 
-    /// Moves every variable one step against its gradient, all gradients together first shortened to the norm
-    /// `clip_norm`. Variables without a gradient stay. Returns the norm before that; nothing moves when it is not finite.
-    ///
-    /// # Errors
-    /// When a tensor operation fails.
-    pub fn step(&mut self, grads: &GradStore, learning_rate: f64, clip_norm: f64) -> Result<f64> {
-        let grad = |var: &Var| grads.get(var).map(|g| g.flatten_all()?.to_vec1::<f32>()).transpose();
-        let grads = self.vars.iter().map(grad).collect::<candle_core::Result<Vec<_>>>()?;
-        self.apply(&grads, learning_rate, clip_norm)
-    }
-
-    /// [`Adam::step`] with gradients as plain numbers, one slice for each variable.
+    /// Moves every variable one step against its gradient (plain numbers, a slice for each variable), all gradients
+    /// together first shortened to the norm `clip_norm`. Variables without a gradient stay. Returns the norm before that;
+    /// nothing moves when it is not finite.
     ///
     /// # Errors
     /// When a tensor operation fails.

@@ -151,13 +151,19 @@ pub struct TrainingConfig {
     pub clip_norm: f64,
 }
 
-/// Training on the iterates of accelerated GAP: each clip is measured through new random masks, and solved; every call of the
-/// denoiser is an update towards the truth.
+/// Training on the iterates of accelerated GAP: each clip is measured through new random masks, and solved with the network as
+/// it is; what the denoiser is given in some of the calls, drawn for each clip, makes the update.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IteratesConfig {
     /// σ of each iteration in 0..255 units, at least one.
     pub sigmas: Vec<f32>,
+    /// Iterations of the start by TV (weight 0.1); 0 starts from the normalised measurement. Default 0.
+    #[serde(default)]
+    pub start_iterations: usize,
+    /// Calls of each clip that are trained on, 1 to the number of `sigmas`. Default 2.
+    #[serde(default = "two")]
+    pub calls: usize,
     /// Frames of a measurement, the fewest and the most, drawn for each clip; 2 to 64.
     pub frames: [usize; 2],
     /// Share of open pixels of binary masks, the least and the most; in (0, 1].
@@ -227,6 +233,9 @@ fn half() -> f64 {
 fn one() -> usize {
     1
 }
+fn two() -> usize {
+    2
+}
 fn average() -> f64 {
     0.999
 }
@@ -276,7 +285,8 @@ impl TrainConfig {
     }
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig { sigmas, frames: [few, many], density: [thin, dense], gray_masks } = iterates;
+        let IteratesConfig { sigmas, start_iterations, calls, frames: [few, many], density: [thin, dense], gray_masks } =
+            iterates;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
         check(self.data.frames == 1, "data.frames", self.data.frames, "left out: iterates.frames says how many")?;
         check(
@@ -285,6 +295,9 @@ impl TrainConfig {
             format_args!("{sigmas:?}"),
             "each 0 to 255",
         )?;
+        check(*start_iterations <= 1000, "iterates.start_iterations", start_iterations, "0 to 1000")?;
+        let legal = "1 to the number of iterates.sigmas";
+        check((1..=sigmas.len()).contains(calls), "iterates.calls", calls, legal)?;
         let frames = (2..=64).contains(few) && (*few..=64).contains(many);
         check(frames, "iterates.frames", format_args!("[{few}, {many}]"), "two numbers from 2 to 64, the lower first")?;
         let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;

@@ -3,11 +3,14 @@
 
 use super::config::IteratesConfig;
 use crate::{Error, Result};
-use admm::{BoxError, Demosaicked, Denoiser, Gap, Plan, Problem, SolveError, Stage, Start, run};
-use ndarray::{Array2, Array3, Array4, ArrayView4, Axis};
+use admm::{BoxError, Demosaicked, DenoiseCx, Denoiser, Gap, Plan, Problem, SolveError, Stage, Start, run};
+use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use rand::{Rng, RngExt};
 use sci_forward::bayer::{Menon, mosaic_into};
 use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoShape};
+
+/// Weight of the TV prior in the start: the one of the reference's, and of configurations.
+const START_WEIGHT: f32 = 0.1;
 
 /// A measurement and what made it.
 pub(super) struct Simulated {
@@ -44,23 +47,83 @@ impl Simulated {
         Ok(Self { operator, y, cfa })
     }
 
-    /// Accelerated GAP from the normalised measurement, one call of the denoiser for each σ; the result is gray or RGB.
+    /// What the solver gives the denoiser in some of its calls, drawn anew, with σ of each. Iterates of one clip are much
+    /// alike, so that few of many clips teach more than all of few.
+    ///
+    /// # Errors
+    /// That of the network.
+    pub(super) fn iterates(
+        &self,
+        settings: &IteratesConfig,
+        denoiser: &mut dyn Denoiser,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<(Array4<f32>, f32)>> {
+        let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
+        calls.sort_unstable();
+        let last = calls.last().copied().unwrap_or(0);
+        let mut recorder = Recorder { denoiser, calls, seen: Vec::new(), call: 0 };
+        self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;
+        Ok(recorder.seen)
+    }
+
+    /// Accelerated GAP from a few iterations of TV, or none of them the normalised measurement; one call of the denoiser for
+    /// each σ; the result is gray or RGB.
     ///
     /// # Errors
     /// That of the network, if it is one of this crate.
-    pub(super) fn solve(&self, sigmas: &[f32], denoiser: &mut dyn Denoiser) -> Result<Array4<f32>> {
+    pub(super) fn solve(
+        &self,
+        sigmas: &[f32],
+        start_iterations: usize,
+        denoiser: &mut dyn Denoiser,
+    ) -> Result<Array4<f32>> {
         let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: s / 255.0, iterations: 1 }).collect();
         let plan = Plan::new(stages);
         let problem = Problem::new(&self.operator, self.y.view()).map_err(typed)?;
+        let start = match start_iterations {
+            0 => Start::Mean,
+            iterations => Start::Tv { iterations, weight: START_WEIGHT, bayer: self.cfa.is_some() },
+        };
         let outcome = match self.cfa {
-            None => run(&mut Gap::accelerated(denoiser), &problem, Start::Mean, &plan, &mut ()),
+            None => run(&mut Gap::accelerated(denoiser), &problem, start, &plan, &mut ()),
             Some(cfa) => {
                 let mut gap = Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa));
-                run(&mut gap, &problem, Start::Mean, &plan, &mut ())
+                run(&mut gap, &problem, start, &plan, &mut ())
             }
         };
         let outcome = outcome.map_err(typed)?;
         Ok(outcome.rgb.unwrap_or_else(|| outcome.estimate.insert_axis(Axis(1))))
+    }
+}
+
+/// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
+struct Recorder<'d> {
+    denoiser: &'d mut dyn Denoiser,
+    calls: Vec<usize>,
+    seen: Vec<(Array4<f32>, f32)>,
+    call: usize,
+}
+
+impl Denoiser for Recorder<'_> {
+    fn name(&self) -> &str {
+        "recorder"
+    }
+
+    fn denoise(
+        &mut self,
+        cx: &DenoiseCx,
+        noisy: ArrayView4<'_, f32>,
+        mut out: ArrayViewMut4<'_, f32>,
+    ) -> std::result::Result<(), BoxError> {
+        if self.calls.contains(&self.call) {
+            self.seen.push((noisy.as_standard_layout().into_owned(), cx.sigma));
+        }
+        self.call += 1;
+        if self.seen.len() == self.calls.len() {
+            out.assign(&noisy);
+            return Ok(());
+        }
+        self.denoiser.denoise(cx, noisy, out)
     }
 }
 

@@ -13,6 +13,7 @@ use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 use sci_forward::metrics::psnr;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -101,6 +102,13 @@ impl Model {
     }
 }
 
+/// Clean clips, what the network sees of them (both `[clips · T, C, P, P]`), σ of each.
+struct Batch {
+    clean: Tensor,
+    seen: Tensor,
+    sigmas: Vec<f32>,
+}
+
 /// One training run.
 ///
 /// ```
@@ -143,35 +151,6 @@ const VALIDATION_STREAM: u64 = 1 << 63;
 /// Frames and largest side of the clips that are reconstructed to validate.
 const VALIDATION_FRAMES: usize = 8;
 const VALIDATION_SIDE: usize = 256;
-
-/// The network as the denoiser of a solver, with an update towards the truth in each call.
-struct Trainee<'t> {
-    trainer: &'t mut Trainer,
-    clean: Tensor,
-    losses: &'t mut Vec<f32>,
-    norms: &'t mut Vec<f64>,
-}
-
-impl Denoiser for Trainee<'_> {
-    fn name(&self) -> &str {
-        "trainee"
-    }
-
-    fn denoise(
-        &mut self,
-        cx: &DenoiseCx,
-        noisy: ArrayView4<'_, f32>,
-        mut out: ArrayViewMut4<'_, f32>,
-    ) -> std::result::Result<(), admm::BoxError> {
-        let seen = stack(&[noisy.as_standard_layout().into_owned()])?;
-        let (output, loss, norm) = self.trainer.update(&self.clean, &seen, &[cx.sigma])?;
-        self.losses.push(loss);
-        self.norms.push(norm);
-        let values = Array4::from_shape_vec(noisy.dim(), output.flatten_all()?.to_vec1()?)?;
-        out.assign(&values);
-        Ok(())
-    }
-}
 
 impl Denoiser for Model {
     fn name(&self) -> &str {
@@ -252,8 +231,8 @@ impl Trainer {
         rng
     }
 
-    /// Clean clips, what the network sees of them, σ of each; `[batch · T, C, P, P]`.
-    fn batch(&self, noise: &NoiseConfig, rng: &mut ChaCha8Rng) -> Result<(Tensor, Tensor, Vec<f32>)> {
+    /// Noisy clips.
+    fn noisy(&self, noise: &NoiseConfig, rng: &mut ChaCha8Rng) -> Result<Batch> {
         let data = &self.config.data;
         let [low, high] = noise.sigma.map(|s| s / 255.0);
         let (mut clean, mut seen, mut sigmas) = (Vec::new(), Vec::new(), Vec::new());
@@ -266,13 +245,33 @@ impl Trainer {
             clean.push(clip);
             sigmas.push(sigma);
         }
-        Ok((stack(&clean)?, stack(&seen)?, sigmas))
+        Ok(Batch { clean: stack(&clean)?, seen: stack(&seen)?, sigmas })
     }
 
-    /// One step: an update by a new batch of noisy clips, or one by each iterate of each clip of a new batch.
+    /// Iterates of the solver with the network as it is, each a batch of its own as clips differ in length.
+    fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Batch>> {
+        let now = self.vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor()));
+        let model = self.frozen(now.collect());
+        let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
+        let clip = |seed: u64| {
+            let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
+            let [few, many] = settings.frames;
+            let frames = rng.random_range(few..=many);
+            let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
+            let simulated = Simulated::random(clip.view(), settings, &mut rng)?;
+            let clean = stack(&[clip])?;
+            let iterates = simulated.iterates(settings, &mut model.clone(), &mut rng)?;
+            let batch = |(seen, sigma)| Ok(Batch { clean: clean.clone(), seen: stack(&[seen])?, sigmas: vec![sigma] });
+            iterates.into_iter().map(batch).collect::<Result<Vec<_>>>()
+        };
+        let clips = seeds.into_par_iter().map(clip).collect::<Result<Vec<_>>>()?;
+        Ok(clips.into_iter().flatten().collect())
+    }
+
+    /// One update, by a new batch of noisy clips or by iterates of a solver.
     ///
     /// # Errors
-    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the update.
+    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the step.
     ///
     /// # Panics
     /// Never: [`Trainer::new`] checked the settings.
@@ -280,57 +279,53 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.config.learning_rate(self.step);
-        let (loss, gradient_norm) = match self.config.iterates.clone() {
-            Some(iterates) => self.reconstruct(&iterates, &mut rng)?,
+        let batches = match self.config.iterates.clone() {
+            Some(iterates) => self.iterates(&iterates, &mut rng)?,
             None => {
                 let noise = self.config.noise.clone().expect("validated: noise or iterates");
-                let (clean, seen, sigmas) = self.batch(&noise, &mut rng)?;
-                let (_, loss, norm) = self.update(&clean, &seen, &sigmas)?;
-                (loss, norm)
+                vec![self.noisy(&noise, &mut rng)?]
             }
         };
+        let (loss, gradients) = self.gradients(&batches)?;
+        let diverged = Error::Diverged { step: self.step + 1, loss };
+        if !loss.is_finite() {
+            return Err(diverged);
+        }
+        let gradient_norm = self.adam.apply(&gradients, learning_rate, self.config.training.clip_norm)?;
+        if !gradient_norm.is_finite() {
+            return Err(diverged);
+        }
+        self.update_average()?;
         self.step += 1;
         Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm })
     }
 
-    /// One update; the output before it, the loss, and the norm of the gradient.
-    fn update(&mut self, clean: &Tensor, seen: &Tensor, sigmas: &[f32]) -> Result<(Tensor, f32, f64)> {
-        let out = self.model.network().forward(seen, sigmas)?;
-        let error = (&out - clean)?;
+    /// The mean loss of the batches, and its gradient for each variable.
+    fn gradients(&self, batches: &[Batch]) -> Result<(f32, Vec<Option<Vec<f32>>>)> {
+        let parts = batches.par_iter().map(|batch| self.gradient(batch)).collect::<Result<Vec<_>>>()?;
+        let share = 1.0 / batches.len() as f32;
+        let (mut mean, mut sums) = (0.0, vec![None; self.vars.len()]);
+        for (loss, gradients) in parts {
+            mean += share * loss;
+            for (sum, gradient) in sums.iter_mut().zip(gradients) {
+                let Some(gradient) = gradient else { continue };
+                let sum = sum.get_or_insert_with(|| vec![0.0; gradient.len()]);
+                sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * g);
+            }
+        }
+        Ok((mean, sums))
+    }
+
+    fn gradient(&self, Batch { clean, seen, sigmas }: &Batch) -> Result<(f32, Vec<Option<Vec<f32>>>)> {
+        let error = (self.model.network().forward(seen, sigmas)? - clean)?;
         let loss = match self.config.training.loss {
             Loss::L1 => error.abs()?,
             Loss::L2 => error.sqr()?,
         }
         .mean_all()?;
-        let value = loss.to_scalar::<f32>()?;
-        let diverged = Error::Diverged { step: self.step + 1, loss: value };
-        if !value.is_finite() {
-            return Err(diverged);
-        }
-        let learning_rate = self.config.learning_rate(self.step);
-        let gradient_norm = self.adam.step(&loss.backward()?, learning_rate, self.config.training.clip_norm)?;
-        if !gradient_norm.is_finite() {
-            return Err(diverged);
-        }
-        self.update_average()?;
-        Ok((out.detach(), value, gradient_norm))
-    }
-
-    /// Solves new measurements, with an update in each call of the denoiser; the means of loss and gradient norm.
-    fn reconstruct(&mut self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<(f32, f64)> {
-        let (mut losses, mut norms) = (Vec::new(), Vec::new());
-        for _ in 0..self.config.data.batch {
-            let data = &self.config.data;
-            let [few, many] = settings.frames;
-            let frames = rng.random_range(few..=many);
-            let clip = self.data.clip(rng, frames, data.patch, data.photo_share);
-            let simulated = Simulated::random(clip.view(), settings, rng)?;
-            let clean = stack(std::slice::from_ref(&clip))?;
-            let mut trainee = Trainee { trainer: self, clean, losses: &mut losses, norms: &mut norms };
-            simulated.solve(&settings.sigmas, &mut trainee)?;
-        }
-        let count = losses.len().max(1);
-        Ok((losses.iter().sum::<f32>() / count as f32, norms.iter().sum::<f64>() / count as f64))
+        let gradients = loss.backward()?;
+        let plain = |(_, var): &(String, Var)| gradients.get(var).map(|g| g.flatten_all()?.to_vec1()).transpose();
+        Ok((loss.to_scalar()?, self.vars.iter().map(plain).collect::<candle_core::Result<_>>()?))
     }
 
     fn update_average(&mut self) -> Result<()> {
@@ -371,7 +366,7 @@ impl Trainer {
     /// # Errors
     /// When a tensor operation fails.
     pub fn validate(&self) -> Result<Vec<Score>> {
-        let mut model = self.averaged()?;
+        let mut model = self.frozen(self.weights()?);
         if let Some(iterates) = &self.config.iterates {
             return Ok(vec![self.score_reconstruction(&mut model, iterates)?]);
         }
@@ -401,7 +396,7 @@ impl Trainer {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
             let simulated = Simulated::random(clean.view(), settings, &mut rng)?;
-            let restored = simulated.solve(&settings.sigmas, model)?;
+            let restored = simulated.solve(&settings.sigmas, settings.start_iterations, model)?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;
@@ -410,18 +405,17 @@ impl Trainer {
         Ok(Score { sigma: None, psnr_db: sum / f64::from(count) })
     }
 
-    /// The model with the averaged weights, for inference.
-    fn averaged(&self) -> Result<Model> {
+    /// The model with these weights, for inference: constants are packed for the kernels once, not at each call.
+    fn frozen(&self, mut weights: BTreeMap<String, Tensor>) -> Model {
         let mut model = self.model.clone();
-        let mut weights = self.weights()?;
         for conv in model.network_mut().convs_mut() {
             for (name, tensor, _) in conv.tensors_mut() {
-                if let Some(average) = weights.remove(&name) {
-                    *tensor = average;
+                if let Some(weight) = weights.remove(&name) {
+                    *tensor = weight;
                 }
             }
         }
-        Ok(model)
+        model
     }
 
     /// Writes a checkpoint; the one that was there is kept as `NAME.previous.safetensors`.
