@@ -19,7 +19,8 @@ use sci_forward::{SensingOperator, held_in};
 /// makes large where the pixels held out see nothing.
 ///
 /// A stage ends when an iteration takes less than `gain` off E, or when after `patience` iterations it has not gone below
-/// the best E before it. The run ends after two stages in a row that did not. A stage whose σ is more than `overshoot · √E`
+/// the best E before it. The run ends after two stages in a row that did not, of no fewer than `2 patience` iterations
+/// together with others before them that are shorter. A stage whose σ is more than `overshoot · √E`
 /// is not begun, unless it is the last: it would smooth more than there is to smooth.
 ///
 /// | Parameter | Default | Purpose | Range |
@@ -75,12 +76,14 @@ struct Rule {
     in_stage: usize,
     /// Stages in a row that did nothing.
     failed: usize,
+    /// Iterations since the best.
+    idle: usize,
 }
 
 impl Rule {
     /// `start` is the error of the video that the run starts from.
     fn new(config: HoldOut, start: f64) -> Self {
-        Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0 }
+        Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0, idle: 0 }
     }
 
     fn skips(&self, sigma: f32) -> bool {
@@ -91,6 +94,7 @@ impl Rule {
     fn observe(&mut self, error: f64, last_of_stage: bool) -> Verdict {
         self.in_stage += 1;
         let stalled = error > self.last * (1.0 - self.config.gain);
+        self.idle = if error < self.best { 0 } else { self.idle + 1 };
         (self.last, self.best) = (error, self.best.min(error));
         // The first iteration of a stage meets what the σ before has left; what it does says nothing about the stage.
         let grace = if self.best < self.best_before { 2 } else { self.config.patience };
@@ -99,7 +103,8 @@ impl Rule {
         }
         self.failed = if self.best < self.best_before { 0 } else { self.failed + 1 };
         (self.best_before, self.in_stage) = (self.best, 0);
-        if self.failed >= 2 { Verdict::Stop } else { Verdict::EndStage }
+        let over = self.failed >= 2 && self.idle >= 2 * self.config.patience;
+        if over { Verdict::Stop } else { Verdict::EndStage }
     }
 }
 
@@ -243,6 +248,15 @@ mod tests {
     #[test]
     fn two_stages_that_only_lose_end_the_run() {
         assert_eq!(follow(1.0, &[0.5, 0.499, 0.6, 0.61, 0.62, 0.55, 0.56, 0.57, 0.1]), (vec![1, 4], true));
+    }
+
+    #[test]
+    fn stages_of_one_iteration_have_the_patience_of_longer_ones() {
+        let mut rule = Rule::new(HoldOut::default(), 1.0);
+        let mut verdicts = [0.5, 0.6, 0.7, 0.6, 0.45, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5].map(|e| rule.observe(e, true));
+        assert_eq!(verdicts[10], Verdict::Stop);
+        verdicts[10] = Verdict::EndStage;
+        assert_eq!(verdicts, [Verdict::EndStage; 11]);
     }
 
     #[test]

@@ -7,7 +7,8 @@ macro_rules! bundled {
     ($($name:literal),*) => { &[$(($name, include_bytes!(concat!("../../weights/", $name, ".safetensors")))),*] };
 }
 
-const BUNDLED: &[(&str, &[u8])] = bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci"];
+const BUNDLED: &[(&str, &[u8])] =
+    bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci", "ddnet"];
 
 /// The names that `bundled:NAME` knows.
 pub fn bundled_names() -> Vec<&'static str> {

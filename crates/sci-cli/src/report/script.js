@@ -103,7 +103,13 @@ function bars(parent, values, pick) {
     return bar;
   });
 }
-/** PSNR and residual curves with a switch between iterations and seconds. */
+const CURVES = [
+  { key: "psnr_db", heading: "PSNR (dB)" },
+  { key: "relative_residual", heading: "relative residual ‖y − Hx‖ / ‖y‖", log: true },
+  { key: "sigma", heading: "σ (of 255)", map: v => 255 * v },
+  { key: "predicted_error", heading: "PSNR that the pixels held out predict (dB)", map: v => -10 * Math.log10(v) },
+];
+/** The trace's curves with a switch between iterations and seconds. */
 function convergence(title, series) {
   if (!series.some(s => s.trace.relative_residual.length || s.trace.psnr_db.length)) return () => {};
   const box = section(title);
@@ -115,13 +121,14 @@ function convergence(title, series) {
     charts.replaceChildren();
     const shown = series.map((s, color) => ({ ...s, color })).filter((_, i) => only === null || i === only);
     const xs = trace => against === "seconds" ? trace.seconds : trace.relative_residual.map((_, i) => i + 1);
-    const of = key => shown.map(s => ({ name: s.name, color: s.color, xs: xs(s.trace), ys: s.trace[key] }));
     const xLabel = against;
-    for (const [key, heading, log] of [["psnr_db", "PSNR (dB)", false], ["relative_residual", "relative residual ‖y − Hx‖ / ‖y‖", true]]) {
-      if (!shown.some(s => s.trace[key].length)) continue;
+    for (const { key, heading, log, map = v => v } of CURVES) {
+      const values = trace => (trace[key] ?? []).map(v => v === null ? null : map(v));
+      if (!shown.some(s => values(s.trace).some(v => v))) continue;
       const cell = put(charts, "div");
       put(cell, "div", { class: "note" }, heading);
-      lines(cell, { label: `${heading} against ${xLabel}`, xLabel, series: of(key), log });
+      lines(cell, { label: `${heading} against ${xLabel}`, xLabel, log,
+        series: shown.map(s => ({ name: s.name, color: s.color, xs: xs(s.trace), ys: values(s.trace) })) });
     }
     legend.replaceChildren();
     shown.forEach(s => {
