@@ -113,6 +113,13 @@ const GRAY: &[Curve] = &[
         sigmas: SIGMAS,
         budgets: NET,
     },
+    Curve {
+        name: "GAP-FastDVDnet for iterates",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\n",
+        weights: None,
+        sigmas: &[20.0, 14.0, 10.0, 7.0],
+        budgets: &[1, 2, 3],
+    },
 ];
 
 const COLOR: &[Curve] = &[
