@@ -8,7 +8,7 @@ macro_rules! bundled {
 }
 
 const BUNDLED: &[(&str, &[u8])] =
-    bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci", "ddnet"];
+    bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci", "ddnet", "fastdvdnet_color"];
 
 /// The names that `bundled:NAME` knows.
 pub fn bundled_names() -> Vec<&'static str> {
