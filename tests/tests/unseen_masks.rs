@@ -6,6 +6,9 @@ use ndarray::Array3;
 const FRAMES: usize = 4;
 const SIDE: usize = 256;
 
+/// Whether a mask is open at frame, row and column.
+type Open = fn((usize, usize, usize)) -> bool;
+
 /// A hash of a place: the same random bit in all runs.
 fn bit(t: usize, y: usize, x: usize) -> bool {
     let mut h = (t as u64) << 40 | (y as u64) << 20 | x as u64;
@@ -34,7 +37,7 @@ fn blocky((t, y, x): (usize, usize, usize)) -> bool {
 fn hadamard((t, y, x): (usize, usize, usize)) -> bool {
     let column = (y * SIDE + x).wrapping_mul(40_503) % (SIDE * SIDE);
     let row = [0x5a3d, 0xc6b1, 0x39e7, 0x9d4b][t];
-    (row & column).count_ones() % 2 == 0
+    (row & column).count_ones().is_multiple_of(2)
 }
 
 /// PSNR in the schedule that `gray/default.toml` has for the trained denoiser.
@@ -56,7 +59,7 @@ fn psnr(bench: &Bench, mask: &str, weights: &str) -> f64 {
 #[test]
 fn masks_of_a_kind_unseen_in_training_lose_no_gain() {
     let bench = Bench::new();
-    let gain = |name: &str, open: fn((usize, usize, usize)) -> bool| {
+    let gain = |name: &str, open: Open| {
         let masks = Array3::from_shape_fn((FRAMES, SIDE, SIDE), |at| f32::from(u8::from(open(at))));
         ndarray_npy::write_npy(bench.path(&format!("{name}.npy")), &masks).unwrap();
         let [before, after] = ["fastdvdnet_gray", "fastdvdnet_gray_sci"].map(|weights| psnr(&bench, name, weights));
@@ -65,8 +68,7 @@ fn masks_of_a_kind_unseen_in_training_lose_no_gain() {
     };
     let seen = gain("random", random);
     assert!(seen > 0.3, "{seen:.2} dB");
-    let unseen: [(&str, fn((usize, usize, usize)) -> bool); 3] =
-        [("shifting", shifting), ("blocky", blocky), ("hadamard", hadamard)];
+    let unseen: [(&str, Open); 3] = [("shifting", shifting), ("blocky", blocky), ("hadamard", hadamard)];
     for (name, open) in unseen {
         let gain = gain(name, open);
         assert!(gain > seen - 0.3, "{name}: {gain:.2} dB, {seen:.2} dB with random masks");
