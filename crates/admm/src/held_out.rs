@@ -19,8 +19,8 @@ use sci_forward::{SensingOperator, held_in};
 /// makes large where the pixels held out see nothing.
 ///
 /// A stage ends when an iteration takes less than `gain` off E, or when after `patience` iterations it has not gone below
-/// the best E before it. The run ends after two stages in a row that did not, of no fewer than `2 patience` iterations
-/// together with others before them that are shorter. A stage whose σ is more than `overshoot · √E`
+/// the best E before it. The run ends when two stages in a row did not and the best E is `2 patience` iterations
+/// old, so that short stages have the patience of long ones. A stage whose σ is more than `overshoot · √E`
 /// is not begun, unless it is the last: it would smooth more than there is to smooth.
 ///
 /// | Parameter | Default | Purpose | Range |

@@ -61,7 +61,7 @@ impl Simulated {
         let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
         calls.sort_unstable();
         let last = calls.last().copied().unwrap_or(0);
-        let mut recorder = Recorder { denoiser, calls, seen: Vec::new(), call: 0 };
+        let mut recorder = Recorder { denoiser, calls, seen: Vec::new() };
         self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;
         Ok(recorder.seen)
     }
@@ -101,7 +101,6 @@ struct Recorder<'d> {
     denoiser: &'d mut dyn Denoiser,
     calls: Vec<usize>,
     seen: Vec<(Array4<f32>, f32)>,
-    call: usize,
 }
 
 impl Denoiser for Recorder<'_> {
@@ -115,10 +114,9 @@ impl Denoiser for Recorder<'_> {
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
-        if self.calls.contains(&self.call) {
+        if self.calls.contains(&cx.iteration) {
             self.seen.push((noisy.as_standard_layout().into_owned(), cx.sigma));
         }
-        self.call += 1;
         if self.seen.len() == self.calls.len() {
             out.assign(&noisy);
             return Ok(());
