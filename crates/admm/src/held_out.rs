@@ -20,7 +20,8 @@ use sci_forward::{SensingOperator, held_in};
 ///
 /// A stage ends when an iteration takes less than `gain` off E, or when after `patience` iterations it has not gone below
 /// the best E before it. The run ends when two stages in a row did not and the best E is `2 patience` iterations
-/// old, so that short stages have the patience of long ones. A stage whose σ is more than `overshoot · √E`
+/// old, so that short stages have the patience of long ones, and when one did not while E rose in each of the last
+/// `patience` iterations: a smaller σ, which overshoots at first, would have made it fall again. A stage whose σ is more than `overshoot · √E`
 /// is not begun, unless it is the last: it would smooth more than there is to smooth.
 ///
 /// | Parameter | Default | Purpose | Range |
@@ -78,12 +79,14 @@ struct Rule {
     failed: usize,
     /// Iterations since the best.
     idle: usize,
+    /// Iterations in a row that raised the error.
+    rising: usize,
 }
 
 impl Rule {
     /// `start` is the error of the video that the run starts from.
     fn new(config: HoldOut, start: f64) -> Self {
-        Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0, idle: 0 }
+        Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0, idle: 0, rising: 0 }
     }
 
     fn skips(&self, sigma: f32) -> bool {
@@ -95,6 +98,7 @@ impl Rule {
         self.in_stage += 1;
         let stalled = error > self.last * (1.0 - self.config.gain);
         self.idle = if error < self.best { 0 } else { self.idle + 1 };
+        self.rising = if error > self.last { self.rising + 1 } else { 0 };
         (self.last, self.best) = (error, self.best.min(error));
         // The first iteration of a stage meets what the σ before has left; what it does says nothing about the stage.
         let grace = if self.best < self.best_before { 2 } else { self.config.patience };
@@ -103,8 +107,10 @@ impl Rule {
         }
         self.failed = if self.best < self.best_before { 0 } else { self.failed + 1 };
         (self.best_before, self.in_stage) = (self.best, 0);
-        let over = self.failed >= 2 && self.idle >= 2 * self.config.patience;
-        if over { Verdict::Stop } else { Verdict::EndStage }
+        let patience = self.config.patience;
+        let idle = self.failed >= 2 && self.idle >= 2 * patience;
+        let lost = self.failed >= 1 && self.rising >= patience;
+        if idle || lost { Verdict::Stop } else { Verdict::EndStage }
     }
 }
 
@@ -247,7 +253,14 @@ mod tests {
 
     #[test]
     fn two_stages_that_only_lose_end_the_run() {
-        assert_eq!(follow(1.0, &[0.5, 0.499, 0.6, 0.61, 0.62, 0.55, 0.56, 0.57, 0.1]), (vec![1, 4], true));
+        assert_eq!(follow(1.0, &[0.5, 0.499, 0.6, 0.61, 0.605, 0.55, 0.56, 0.57, 0.1]), (vec![1, 4], true));
+    }
+
+    #[test]
+    fn a_stage_that_only_rises_ends_the_run() {
+        assert_eq!(follow(1.0, &[0.5, 0.499, 0.51, 0.52, 0.53, 0.1]), (vec![1], true));
+        // The first rise is of the σ that changed.
+        assert_eq!(follow(1.0, &[0.5, 0.499, 0.6, 0.51, 0.52, 0.45]), (vec![1, 4], false));
     }
 
     #[test]

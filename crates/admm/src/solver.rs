@@ -59,7 +59,7 @@ pub enum StopReason {
     ScheduleDone,
     /// The relative change fell to the tolerance.
     Converged,
-    /// Two stages in a row did nothing for the held-out pixels ([`HoldOut`](crate::HoldOut)).
+    /// Stages did nothing for the held-out pixels any more ([`HoldOut`](crate::HoldOut)).
     Stalled,
     /// A value was not finite, the residual exploded, or what came out cannot be a scene: it explains the measurement worse than
     /// a black video, or is far brighter than it. The outcome holds the iterate that explains the measurement best.

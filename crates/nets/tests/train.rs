@@ -98,6 +98,7 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.iterates = Some(IteratesConfig {
         sigmas: vec![50.0, 25.0, 12.0],
         calls: 2,
+        unrolled: false,
         start_iterations: 2,
         frames: [2, 4],
         density: [0.3, 0.7],

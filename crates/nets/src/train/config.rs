@@ -2,6 +2,7 @@
 
 use crate::video::Ends;
 use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -164,6 +165,12 @@ pub struct IteratesConfig {
     /// Calls of each clip that are trained on, 1 to the number of `sigmas`. Default 2.
     #[serde(default = "two")]
     pub calls: usize,
+    /// Whether those calls follow one another (the last is drawn) and the gradient goes back from each to those before it,
+    /// through the solver: a call then learns what helps the next ones. The loss of each weighs half as much as that of the
+    /// next. Gray only. Default false: calls drawn at random,
+    /// each by itself.
+    #[serde(default)]
+    pub unrolled: bool,
     /// Frames of a measurement, the fewest and the most, drawn for each clip; 2 to 64.
     pub frames: [usize; 2],
     /// Share of open pixels of binary masks, the least and the most; in (0, 1].
@@ -193,6 +200,17 @@ pub enum Loss {
     L1,
     /// Squared error.
     L2,
+}
+
+impl Loss {
+    /// The mean over all values of an error.
+    pub(super) fn mean(self, error: &Tensor) -> candle_core::Result<Tensor> {
+        match self {
+            Self::L1 => error.abs()?,
+            Self::L2 => error.sqr()?,
+        }
+        .mean_all()
+    }
 }
 
 /// PSNR on held-out clips.
@@ -285,8 +303,10 @@ impl TrainConfig {
     }
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig { sigmas, start_iterations, calls, frames: [few, many], density: [thin, dense], gray_masks } =
+        let IteratesConfig { sigmas, start_iterations, calls, frames: [few, many], density: [thin, dense], gray_masks, unrolled } =
             iterates;
+        let gray = self.network.channels() == 1;
+        check(gray || !unrolled, "iterates.unrolled", unrolled, "false for color: demosaicing has no gradient here")?;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
         check(self.data.frames == 1, "data.frames", self.data.frames, "left out: iterates.frames says how many")?;
         check(

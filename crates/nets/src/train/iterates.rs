@@ -13,6 +13,7 @@ use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoSha
 const START_WEIGHT: f32 = 0.1;
 
 /// A measurement and what made it.
+#[derive(Clone)]
 pub(super) struct Simulated {
     operator: MaskOperator,
     y: Array2<f32>,
@@ -47,6 +48,11 @@ impl Simulated {
         Ok(Self { operator, y, cfa })
     }
 
+    /// H.
+    pub(super) fn operator(&self) -> &MaskOperator {
+        &self.operator
+    }
+
     /// What the solver gives the denoiser in some of its calls, drawn anew, with σ of each. Iterates of one clip are much
     /// alike, so that few of many clips teach more than all of few.
     ///
@@ -60,6 +66,29 @@ impl Simulated {
     ) -> Result<Vec<(Array4<f32>, f32)>> {
         let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
         calls.sort_unstable();
+        self.record(settings, denoiser, calls)
+    }
+
+    /// [`Self::iterates`] of consecutive calls; which is the last is drawn.
+    ///
+    /// # Errors
+    /// That of the network.
+    pub(super) fn last_calls(
+        &self,
+        settings: &IteratesConfig,
+        denoiser: &mut dyn Denoiser,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<(Array4<f32>, f32)>> {
+        let first = rng.random_range(0..=settings.sigmas.len() - settings.calls);
+        self.record(settings, denoiser, (first..first + settings.calls).collect())
+    }
+
+    fn record(
+        &self,
+        settings: &IteratesConfig,
+        denoiser: &mut dyn Denoiser,
+        calls: Vec<usize>,
+    ) -> Result<Vec<(Array4<f32>, f32)>> {
         let last = calls.last().copied().unwrap_or(0);
         let mut recorder = Recorder { denoiser, calls, seen: Vec::new() };
         self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;

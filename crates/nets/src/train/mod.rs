@@ -10,6 +10,7 @@ mod iterates;
 mod muon;
 mod noise;
 mod step;
+mod unrolled;
 
 pub use adam::Adam;
 pub use config::{

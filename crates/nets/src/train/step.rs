@@ -2,13 +2,15 @@
 
 use super::adam::Adam;
 use super::checkpoint::{self, Meta};
-use super::config::{IteratesConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig};
+use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig};
 use super::data::{TrainData, to_video};
 use super::iterates::Simulated;
 use super::noise::{add_noise, sensor};
+use super::unrolled::Unrolled;
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
 use admm::{DenoiseCx, Denoiser};
+use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
 use rand::{RngExt, SeedableRng};
@@ -107,6 +109,36 @@ struct Batch {
     clean: Tensor,
     seen: Tensor,
     sigmas: Vec<f32>,
+}
+
+/// What an update learns from.
+enum Lesson {
+    /// Noisy clips, or one iterate of a solver.
+    Batch(Batch),
+    /// Some iterations of a solver.
+    Unrolled(Unrolled),
+}
+
+/// A loss, and its gradient for each variable (nothing for those it does not depend on).
+pub(super) struct Gradients {
+    pub loss: f32,
+    pub of_vars: Vec<Option<Vec<f32>>>,
+}
+
+impl Gradients {
+    pub(super) fn zero(vars: usize) -> Self {
+        Self { loss: 0.0, of_vars: vec![None; vars] }
+    }
+
+    /// Adds `share` times another.
+    pub(super) fn add(&mut self, loss: f32, of_vars: Vec<Option<Vec<f32>>>, share: f32) {
+        self.loss += share * loss;
+        for (sum, gradient) in self.of_vars.iter_mut().zip(of_vars) {
+            let Some(gradient) = gradient else { continue };
+            let sum = sum.get_or_insert_with(|| vec![0.0; gradient.len()]);
+            sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * g);
+        }
+    }
 }
 
 /// One training run.
@@ -248,8 +280,9 @@ impl Trainer {
         Ok(Batch { clean: stack(&clean)?, seen: stack(&seen)?, sigmas })
     }
 
-    /// Iterates of the solver with the network as it is, each a batch of its own as clips differ in length.
-    fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Batch>> {
+    /// Iterates of the solver with the network as it is, each a lesson of its own as clips differ in length; with
+    /// `unrolled` a lesson for each clip.
+    fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
         let now = self.vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor()));
         let model = self.frozen(now.collect());
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
@@ -260,9 +293,16 @@ impl Trainer {
             let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
             let simulated = Simulated::random(clip.view(), settings, &mut rng)?;
             let clean = stack(&[clip])?;
-            let iterates = simulated.iterates(settings, &mut model.clone(), &mut rng)?;
-            let batch = |(seen, sigma)| Ok(Batch { clean: clean.clone(), seen: stack(&[seen])?, sigmas: vec![sigma] });
-            iterates.into_iter().map(batch).collect::<Result<Vec<_>>>()
+            let mut model = model.clone();
+            if settings.unrolled {
+                let calls = simulated.last_calls(settings, &mut model, &mut rng)?;
+                return Ok(vec![Lesson::Unrolled(Unrolled { simulated, clean, calls })]);
+            }
+            let calls = simulated.iterates(settings, &mut model, &mut rng)?;
+            let lesson = |(seen, sigma)| {
+                Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(seen)?, sigmas: vec![sigma] }))
+            };
+            calls.into_iter().map(lesson).collect::<Result<Vec<_>>>()
         };
         let clips = seeds.into_par_iter().map(clip).collect::<Result<Vec<_>>>()?;
         Ok(clips.into_iter().flatten().collect())
@@ -279,19 +319,19 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.config.learning_rate(self.step);
-        let batches = match self.config.iterates.clone() {
+        let lessons = match self.config.iterates.clone() {
             Some(iterates) => self.iterates(&iterates, &mut rng)?,
             None => {
                 let noise = self.config.noise.clone().expect("validated: noise or iterates");
-                vec![self.noisy(&noise, &mut rng)?]
+                vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
-        let (loss, gradients) = self.gradients(&batches)?;
+        let Gradients { loss, of_vars } = self.gradients(&lessons)?;
         let diverged = Error::Diverged { step: self.step + 1, loss };
         if !loss.is_finite() {
             return Err(diverged);
         }
-        let gradient_norm = self.adam.apply(&gradients, learning_rate, self.config.training.clip_norm)?;
+        let gradient_norm = self.adam.apply(&of_vars, learning_rate, self.config.training.clip_norm)?;
         if !gradient_norm.is_finite() {
             return Err(diverged);
         }
@@ -300,32 +340,25 @@ impl Trainer {
         Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm })
     }
 
-    /// The mean loss of the batches, and its gradient for each variable.
-    fn gradients(&self, batches: &[Batch]) -> Result<(f32, Vec<Option<Vec<f32>>>)> {
-        let parts = batches.par_iter().map(|batch| self.gradient(batch)).collect::<Result<Vec<_>>>()?;
-        let share = 1.0 / batches.len() as f32;
-        let (mut mean, mut sums) = (0.0, vec![None; self.vars.len()]);
-        for (loss, gradients) in parts {
-            mean += share * loss;
-            for (sum, gradient) in sums.iter_mut().zip(gradients) {
-                let Some(gradient) = gradient else { continue };
-                let sum = sum.get_or_insert_with(|| vec![0.0; gradient.len()]);
-                sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * g);
-            }
-        }
-        Ok((mean, sums))
+    /// The mean loss of the lessons, and its gradient.
+    fn gradients(&self, lessons: &[Lesson]) -> Result<Gradients> {
+        let parts = lessons.par_iter().map(|lesson| self.gradient(lesson)).collect::<Result<Vec<_>>>()?;
+        let mut mean = Gradients::zero(self.vars.len());
+        let share = 1.0 / lessons.len() as f32;
+        parts.into_iter().for_each(|part| mean.add(part.loss, part.of_vars, share));
+        Ok(mean)
     }
 
-    fn gradient(&self, Batch { clean, seen, sigmas }: &Batch) -> Result<(f32, Vec<Option<Vec<f32>>>)> {
-        let error = (self.model.network().forward(seen, sigmas)? - clean)?;
-        let loss = match self.config.training.loss {
-            Loss::L1 => error.abs()?,
-            Loss::L2 => error.sqr()?,
+    fn gradient(&self, lesson: &Lesson) -> Result<Gradients> {
+        let (network, loss) = (self.model.network(), self.config.training.loss);
+        match lesson {
+            Lesson::Unrolled(unrolled) => unrolled.gradient(network, &self.vars, loss),
+            Lesson::Batch(Batch { clean, seen, sigmas }) => {
+                let loss = loss.mean(&(network.forward(seen, sigmas)? - clean)?)?;
+                let of_vars = gradients_of(&loss.backward()?, &self.vars)?;
+                Ok(Gradients { loss: loss.to_scalar()?, of_vars })
+            }
         }
-        .mean_all()?;
-        let gradients = loss.backward()?;
-        let plain = |(_, var): &(String, Var)| gradients.get(var).map(|g| g.flatten_all()?.to_vec1()).transpose();
-        Ok((loss.to_scalar()?, self.vars.iter().map(plain).collect::<candle_core::Result<_>>()?))
     }
 
     fn update_average(&mut self) -> Result<()> {
@@ -478,6 +511,12 @@ impl Trainer {
     }
 }
 
+/// The gradient for each of `vars`, as plain numbers.
+pub(super) fn gradients_of(store: &GradStore, vars: &[(String, Var)]) -> Result<Vec<Option<Vec<f32>>>> {
+    let plain = |(_, var): &(String, Var)| store.get(var).map(|g| g.flatten_all()?.to_vec1()).transpose();
+    Ok(vars.iter().map(plain).collect::<candle_core::Result<_>>()?)
+}
+
 fn values(var: &Var) -> Result<Vec<f32>> {
     Ok(var.flatten_all()?.to_vec1()?)
 }
@@ -491,11 +530,14 @@ fn centre(video: &Array4<f32>) -> Array4<f32> {
 }
 
 /// Clips of equal shape, one after another.
-fn stack(clips: &[Array4<f32>]) -> Result<Tensor> {
+pub(super) fn stack(clips: &[Array4<f32>]) -> Result<Tensor> {
     let views: Vec<_> = clips.iter().map(|clip| clip.view()).collect();
-    let all = concatenate(Axis(0), &views).map_err(|e| Error::Data(e.to_string()))?;
-    let shape = all.dim();
-    Ok(Tensor::from_vec(all.into_raw_vec_and_offset().0, shape, &Device::Cpu)?)
+    tensor(concatenate(Axis(0), &views).map_err(|e| Error::Data(e.to_string()))?)
+}
+
+pub(super) fn tensor(video: Array4<f32>) -> Result<Tensor> {
+    let shape = video.dim();
+    Ok(Tensor::from_iter(video, &Device::Cpu)?.reshape(shape)?)
 }
 
 /// Over all channels of a frame.
