@@ -98,7 +98,8 @@ fn gray_weights_on_a_color_scene() {
     let Some(root) = data_root() else { return };
     let bench = Bench::new();
     let mut command = bench.command(&["run", "--out", "out", "--set", "denoiser.weights=ffdnet_gray.pth"]);
-    let run = bench.finish(command.arg(workspace().join("configs/color/default.toml")).env("SCI_DATA", root));
+    let run =
+        bench.finish(command.arg(workspace().join("configs/color/two-stage-ffdnet-fast.toml")).env("SCI_DATA", root));
     assert_eq!(run.code, 1);
     assert!(run.stderr.contains("1 channels") && run.stderr.contains("scene is color"), "{}", run.stderr);
 }

@@ -114,6 +114,13 @@ const GRAY: &[Curve] = &[
         budgets: NET,
     },
     Curve {
+        name: "GAP-FFDNet, [skip]",
+        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n[skip]\n",
+        weights: Some("ffdnet_gray.pth"),
+        sigmas: SIGMAS,
+        budgets: &[5, 10],
+    },
+    Curve {
         name: "GAP-FastDVDnet for iterates",
         experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\n",
         weights: None,
@@ -150,6 +157,20 @@ const COLOR: &[Curve] = &[
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
         budgets: &[1, 2, 4],
+    },
+    Curve {
+        name: "two-stage FFDNet, scaled, [skip]",
+        experiment: "[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n[skip]\n",
+        weights: Some("ffdnet_color.pth"),
+        sigmas: SIGMAS,
+        budgets: &[4],
+    },
+    Curve {
+        name: "GAP-FastDVDnet for iterates",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\n",
+        weights: None,
+        sigmas: &[20.0, 14.0, 10.0, 7.0],
+        budgets: &[1, 2, 3],
     },
 ];
 

@@ -303,8 +303,15 @@ impl TrainConfig {
     }
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig { sigmas, start_iterations, calls, frames: [few, many], density: [thin, dense], gray_masks, unrolled } =
-            iterates;
+        let IteratesConfig {
+            sigmas,
+            start_iterations,
+            calls,
+            frames: [few, many],
+            density: [thin, dense],
+            gray_masks,
+            unrolled,
+        } = iterates;
         let gray = self.network.channels() == 1;
         check(gray || !unrolled, "iterates.unrolled", unrolled, "false for color: demosaicing has no gradient here")?;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;

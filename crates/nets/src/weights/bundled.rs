@@ -7,8 +7,15 @@ macro_rules! bundled {
     ($($name:literal),*) => { &[$(($name, include_bytes!(concat!("../../weights/", $name, ".safetensors")))),*] };
 }
 
-const BUNDLED: &[(&str, &[u8])] =
-    bundled!["ffdnet_gray", "ffdnet_color", "fastdvdnet_gray", "fastdvdnet_gray_sci", "ddnet", "fastdvdnet_color"];
+const BUNDLED: &[(&str, &[u8])] = bundled![
+    "ffdnet_gray",
+    "ffdnet_color",
+    "fastdvdnet_gray",
+    "fastdvdnet_gray_sci",
+    "ddnet",
+    "fastdvdnet_color",
+    "fastdvdnet_color_sci"
+];
 
 /// The names that `bundled:NAME` knows.
 pub fn bundled_names() -> Vec<&'static str> {
