@@ -115,7 +115,7 @@ const GRAY: &[Curve] = &[
     },
     Curve {
         name: "GAP-FFDNet, [skip]",
-        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n[skip]\n",
+        experiment: "[skip]\n[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
         budgets: &[5, 10],
@@ -160,7 +160,7 @@ const COLOR: &[Curve] = &[
     },
     Curve {
         name: "two-stage FFDNet, scaled, [skip]",
-        experiment: "[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n[skip]\n",
+        experiment: "[skip]\n[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
         budgets: &[4],

@@ -49,10 +49,11 @@ impl<'s> Checker<'s> {
 }
 
 /// Lets TV go first where a network would: as a stage of its own from the mean, for as long as it pays, so that the network
-/// begins where TV ends. A two-stage solver has its own start with TV.
+/// begins where TV ends. A start by TV does that already, and so does a two-stage solver.
 pub(super) fn cheap_first(e: &mut Experiment) {
     let networks_first = e.stages.first().is_some_and(|s| !matches!(e.denoisers[s.denoiser], Denoiser::Tv { .. }));
-    if !e.skip.is_some_and(|s| s.cheap_first) || !networks_first || matches!(e.solver, Solver::TwoStage { .. }) {
+    let starts_with_tv = matches!(e.start, Start::Tv { .. }) || matches!(e.solver, Solver::TwoStage { .. });
+    if !e.skip.is_some_and(|s| s.cheap_first) || !networks_first || starts_with_tv {
         return;
     }
     if let Start::Adjoint = e.start {
