@@ -15,6 +15,14 @@ fn run(bench: &Bench, config: &Path, out: &str, set: &[&str]) -> Vec<u8> {
     std::fs::read(bench.path(&format!("{out}/recon.npy"))).unwrap()
 }
 
+/// An experiment of `configs`, on the demo's video.
+fn on_the_demo(config: &str) -> String {
+    let config = std::fs::read_to_string(workspace().join("configs").join(config)).unwrap();
+    let video = format!("kind = \"simulate\"\npath = '{}'\n", workspace().join("configs/demo/bunny").display());
+    let data = config.find("path = ").unwrap()..config.find("[solver]").unwrap();
+    [&config[..data.start], &video, "[data.mask]\nkind = \"random\"\n", &config[data.end..]].concat()
+}
+
 #[test]
 fn switched_off_it_changes_no_bit() {
     let bench = Bench::new();
@@ -30,12 +38,7 @@ fn switched_off_it_changes_no_bit() {
 #[test]
 fn a_network_is_given_the_sigmas_that_auto_stands_for() {
     let bench = Bench::new();
-    let auto = workspace().join("configs/gray/auto.toml");
-    let config = std::fs::read_to_string(auto).unwrap();
-    let video = format!("kind = \"simulate\"\npath = '{}'\n", workspace().join("configs/demo/bunny").display());
-    let data = config.find("path = ").unwrap()..config.find("[solver]").unwrap();
-    let config = [&config[..data.start], &video, "[data.mask]\nkind = \"random\"\n", &config[data.end..]].concat();
-    std::fs::write(bench.path("auto.toml"), config).unwrap();
+    std::fs::write(bench.path("auto.toml"), on_the_demo("gray/auto.toml")).unwrap();
     run(&bench, &bench.path("auto.toml"), "auto", &["stage.0.iterations=4"]);
     let record = bench.record("auto");
     let m = &record["measurements"][0];
@@ -52,4 +55,19 @@ fn a_network_is_given_the_sigmas_that_auto_stands_for() {
     assert_eq!(errors.len(), sigmas.len());
     assert!(errors.iter().all(|&e| e > 0.0) && errors.last() < errors.first(), "{errors:?}");
     assert!(m["skipped"]["iterations"].as_u64().unwrap() > 0, "{}", m["skipped"]);
+}
+
+#[test]
+fn tv_goes_first_only_once() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
+    let iterations_of_tv = |solver: &str| {
+        let stages = "stage=[{sigma=20,iterations=2}]";
+        run(&bench, &bench.path("default.toml"), "out", &[stages, "skip.enabled=true", solver]);
+        let record = bench.record("out");
+        let sigmas = record["measurements"][0]["trace"]["sigma"].as_array().unwrap().clone();
+        sigmas.iter().filter(|s| s.as_f64() == Some(0.0)).count()
+    };
+    assert_eq!(iterations_of_tv("solver.momentum=\"measurement\""), 0);
+    assert!(iterations_of_tv("solver={kind=\"gap\",start=\"mean\"}") > 0);
 }

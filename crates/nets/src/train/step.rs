@@ -116,7 +116,7 @@ enum Lesson {
     /// Noisy clips, or one iterate of a solver.
     Batch(Batch),
     /// Some iterations of a solver.
-    Unrolled(Unrolled),
+    Unrolled(Box<Unrolled>),
 }
 
 /// A loss, and its gradient for each variable (nothing for those it does not depend on).
@@ -296,7 +296,7 @@ impl Trainer {
             let mut model = model.clone();
             if settings.unrolled {
                 let calls = simulated.last_calls(settings, &mut model, &mut rng)?;
-                return Ok(vec![Lesson::Unrolled(Unrolled { simulated, clean, calls })]);
+                return Ok(vec![Lesson::Unrolled(Box::new(Unrolled { simulated, clean, calls }))]);
             }
             let calls = simulated.iterates(settings, &mut model, &mut rng)?;
             let lesson = |(seen, sigma)| {

@@ -95,7 +95,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let clip = Array4::from_shape_fn((3, 1, 12, 12), |(t, _, y, x)| ((7 * t + 5 * y + 3 * x) % 11) as f32 / 11.0);
         let simulated = Simulated::random(clip.view(), &settings, &mut rng).unwrap();
-        let (clean, vars) = (stack(&[clip.clone()]).unwrap(), net.make_trainable().unwrap());
+        let (clean, vars) = (stack(std::slice::from_ref(&clip)).unwrap(), net.make_trainable().unwrap());
 
         let loss_at = |net: &mut Ffdnet| -> f64 {
             let mut seen = Vec::new();
