@@ -10,7 +10,7 @@ use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::plot::{Axis, Look, Plot, Series};
+use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
 use crate::workspace::{built_sci, cpu, json_lines, median, output, range, results_dir, revision, sci_run, shared};
 
 #[derive(clap::Args)]
@@ -472,7 +472,8 @@ fn save_plots(points: &[Point], published: &[(&str, f64)], title: &str, path: &P
     let rmse = |db: f64| 255.0 * 10f64.powf(-db / 20.0);
     let plot = |what: &str, y: Axis, of: &dyn Fn(f64) -> f64| {
         let caption = format!("Run time against {what}: {title}");
-        Plot { caption, x: Axis { label: "seconds", log: true }, y, series: series(points, published, of) }.svg()
+        let (x, series) = (Axis { label: "seconds", log: true }, series(points, published, of));
+        Plot { caption, x, y, series, shades: 1, legend: SeriesLabelPosition::LowerRight }.svg()
     };
     let quality = plot("quality", Axis { label: "PSNR (dB)", log: false }, &psnr)?;
     fs::write(path.with_extension("svg"), quality)?;

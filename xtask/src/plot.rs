@@ -1,6 +1,7 @@
 //! Plots as SVG.
 
 use anyhow::anyhow;
+pub(crate) use plotters::chart::SeriesLabelPosition;
 use plotters::prelude::*;
 
 /// Dark enough for a thin line on white.
@@ -43,6 +44,10 @@ pub(crate) struct Plot {
     pub(crate) x: Axis,
     pub(crate) y: Axis,
     pub(crate) series: Vec<Series>,
+    /// How many series in a row share a color, each paler than the one before.
+    pub(crate) shades: usize,
+    /// The corner that the curves leave free.
+    pub(crate) legend: SeriesLabelPosition,
 }
 
 #[derive(Clone, Copy)]
@@ -105,7 +110,11 @@ impl Plot {
             .light_line_style(TRANSPARENT)
             .draw()?;
         for (i, series) in self.series.iter().enumerate() {
-            let color = if series.look == Look::Front { BLACK } else { COLORS[i % COLORS.len()] }.to_rgba();
+            let color = match series.look {
+                Look::Front => BLACK.to_rgba(),
+                _ => COLORS[i / self.shades % COLORS.len()]
+                    .mix(1.0 - 0.8 * (i % self.shades) as f64 / self.shades as f64),
+            };
             let points = self.points(series);
             let drawn = match series.look {
                 Look::Curve => {
@@ -125,7 +134,7 @@ impl Plot {
         }
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
+            .position(self.legend.clone())
             .background_style(WHITE.mix(0.8))
             .border_style(BLACK)
             .draw()?;

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use serde_json::Value;
 
-use crate::plot::{Axis, Look, Plot, Series};
+use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
 use crate::workspace::{built_sci, results_dir, root, sci_run};
 
 #[derive(clap::Args)]
@@ -107,6 +107,8 @@ fn plot(runs: &[Run]) -> Plot {
         x: Axis { label: "iteration", log: false },
         y: Axis { label: "PSNR (dB)", log: false },
         series: series.collect(),
+        shades: UPDATES.len(),
+        legend: SeriesLabelPosition::LowerLeft,
     }
 }
 

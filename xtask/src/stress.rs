@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::ensure;
 use serde_json::Value;
 
-use crate::plot::{Axis, Look, Plot, Series};
+use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
 use crate::workspace::{Finished, built_sci, cargo, json_lines, output, results_dir, sci_run, shared};
 
 #[derive(clap::Args)]
@@ -101,6 +101,8 @@ fn drift_plot(lines: &[&Value]) -> anyhow::Result<String> {
         x: Axis { label: "iteration", log: false },
         y: Axis { label: "difference", log: true },
         series: vec![Series { name: "accelerated GAP-TV".into(), points, look: Look::Front }],
+        shades: 1,
+        legend: SeriesLabelPosition::LowerRight,
     }
     .svg()
 }
