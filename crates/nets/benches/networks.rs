@@ -4,8 +4,8 @@ use admm::{DenoiseCx, Denoiser};
 use criterion::{Criterion, criterion_group, criterion_main};
 use ndarray::Array4;
 use nets::train::{
-    CheckpointConfig, DataConfig, Frame, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainData, Trainer,
-    TrainingConfig, ValidationConfig,
+    CheckpointConfig, DataConfig, Frame, Loss, NetworkConfig, NoiseConfig, Optimizer, Precision, TrainConfig,
+    TrainData, Trainer, TrainingConfig, ValidationConfig,
 };
 use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec};
 
@@ -46,6 +46,7 @@ fn training(c: &mut Criterion) {
         training: TrainingConfig {
             steps: u64::MAX,
             optimizer: Optimizer::Muon,
+            precision: Precision::F32,
             loss: Loss::L1,
             learning_rate: 1e-3,
             final_learning_rate: 0.0,

@@ -1,6 +1,6 @@
 //! Convolution layers with optional batch norm, and where their tensors come from.
 
-use crate::kernels::{Conv3x3, Link, conv_chain};
+use crate::kernels::{Conv3x3, Link, Precision, conv_chain};
 use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
 use rand_chacha::ChaCha8Rng;
@@ -87,8 +87,14 @@ impl Conv {
         Ok(Self { name, opts, weight, bias, norm })
     }
 
+    /// How inference does the layer, in f32 always.
     pub(crate) fn opts(&self) -> Conv3x3 {
-        self.opts
+        Conv3x3 { precision: Precision::F32, ..self.opts }
+    }
+
+    /// What the differentiable layer multiplies.
+    pub(crate) fn set_precision(&mut self, precision: Precision) {
+        self.opts.precision = precision;
     }
 
     pub(crate) fn device(&self) -> &Device {

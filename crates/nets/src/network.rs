@@ -1,5 +1,6 @@
 //! What the networks have in common: named tensors, a differentiable forward pass, frames in and out.
 
+use crate::kernels::Precision;
 use crate::layers::{Conv, Parameters};
 use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
@@ -73,6 +74,12 @@ pub trait Network: Send + Sync {
 
     #[doc(hidden)]
     fn convs_mut(&mut self) -> Vec<&mut Conv>;
+
+    /// What [`Network::forward`] and the gradient multiply: f32 unless this asks for [`Precision::Bf16`]. Inference
+    /// (as a denoiser) is not changed by it.
+    fn set_precision(&mut self, precision: Precision) {
+        self.convs_mut().into_iter().for_each(|conv| conv.set_precision(precision));
+    }
 
     /// Every tensor under its published name, batch norm statistics included.
     fn state(&self) -> BTreeMap<String, Tensor> {

@@ -133,7 +133,13 @@ impl Block {
                 (true, true) => Shift::Norm(norm_after(&format!("{stage}.{name}"))),
             };
             let groups = if i == 0 { 3 } else { 1 };
-            Conv::new(source, format!("{stage}.{name}"), channels, Conv3x3 { stride, groups, relu: hidden }, shift)
+            Conv::new(
+                source,
+                format!("{stage}.{name}"),
+                channels,
+                Conv3x3 { stride, groups, relu: hidden, ..Conv3x3::default() },
+                shift,
+            )
         };
         let convs = LAYERS.into_iter().zip(channels).enumerate().map(layer).collect::<Result<_>>()?;
         Ok(Self { convs })

@@ -1,7 +1,9 @@
 //! The convolution kernels against a slow loop in f64, golden arrays, finite differences, and themselves on other threads.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use nets::kernels::{Blocked, Conv3x3, Isa, LANES, PackedConv, Scratch, conv3x3, conv3x3_on};
+use nets::kernels::{
+    Blocked, Conv3x3, Isa, LANES, Link, PackedConv, Precision, Scratch, conv_chain, conv3x3, conv3x3_on,
+};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -70,7 +72,7 @@ impl Case {
     }
 
     fn opts(&self, relu: bool) -> Conv3x3 {
-        Conv3x3 { stride: self.stride, groups: self.groups, relu }
+        Conv3x3 { stride: self.stride, groups: self.groups, relu, ..Conv3x3::default() }
     }
 
     fn operands(&self, seed: u64) -> Operands {
@@ -151,13 +153,17 @@ fn exact(case: &Case, ops: &Operands) -> Exact {
 
 /// Result and gradients of `Σ y·g` by the kernels.
 fn ours(isa: Isa, case: &Case, ops: &Operands, relu: bool) -> Result<[Vec<f32>; 4]> {
+    ours_with(isa, case, ops, case.opts(relu))
+}
+
+fn ours_with(isa: Isa, case: &Case, ops: &Operands, opts: Conv3x3) -> Result<[Vec<f32>; 4]> {
     let cpu = &Device::Cpu;
     let [h, w] = case.out();
     let x = Var::from_slice(&ops.x, (case.batch, case.inputs, case.height, case.width), cpu)?;
     let k = Var::from_slice(&ops.w, (case.outputs, case.inputs / case.groups, 3, 3), cpu)?;
     let b = Var::from_slice(&ops.b, case.outputs, cpu)?;
     let g = Tensor::from_slice(&ops.g, (case.batch, case.outputs, h, w), cpu)?;
-    let y = conv3x3_on(isa, &x, &k, Some(&b), case.opts(relu))?;
+    let y = conv3x3_on(isa, &x, &k, Some(&b), opts)?;
     let grads = (&y * &g)?.sum_all()?.backward()?;
     let flat = |t: &Tensor| t.flatten_all()?.to_vec1::<f32>();
     let grad = |v: &Var| flat(grads.get(v).expect("a gradient for every variable"));
@@ -204,6 +210,63 @@ fn agrees_with_the_definition() -> Result<()> {
             check(&name("db"), &db, &e.db, 1e-5);
         }
     }
+    Ok(())
+}
+
+/// Of numbers that are bf16 already, products in bf16 are exact.
+#[test]
+fn bf16_rounds_what_it_multiplies_and_nothing_else() -> Result<()> {
+    for (seed, case) in CASES.iter().enumerate() {
+        let mut ops = case.operands(seed as u64);
+        for v in [&mut ops.x, &mut ops.w, &mut ops.g].into_iter().flatten() {
+            *v = f32::from_bits(v.to_bits() & 0xffff_0000);
+        }
+        let e = exact(case, &ops);
+        for isa in available() {
+            let opts = Conv3x3 { precision: Precision::Bf16, ..case.opts(false) };
+            let found = ours_with(isa, case, &ops, opts)?;
+            for ((found, e), part) in found.iter().zip([&e.y, &e.dx, &e.dw, &e.db]).zip(["y", "dx", "dw", "db"]) {
+                check(&format!("{part} of {case:?} on {isa:?}"), found, e, 3e-5);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A chain in bf16, strides and ReLUs among its layers, learns what one in f32 does, on any number of threads the same.
+#[test]
+fn gradients_of_a_chain_in_bf16_are_near_those_in_f32() -> Result<()> {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let cpu = &Device::Cpu;
+    let x = Var::from_vec(uniform(&mut rng, 2 * 3 * 22 * 38, 1.0), (2, 3, 22, 38), cpu)?;
+    let mut shape = |o: usize, i: usize| {
+        let scale = (6.0 / (9 * i) as f32).sqrt();
+        let w = Var::from_vec(uniform(&mut rng, o * i * 9, scale), (o, i, 3, 3), cpu)?;
+        Ok::<_, candle_core::Error>((w, Var::from_vec(uniform(&mut rng, o, 0.1), o, cpu)?))
+    };
+    let params = [shape(40, 3)?, shape(70, 40)?, shape(33, 70)?, shape(8, 33)?];
+    let gradients = |precision: Precision| -> Result<Vec<f32>> {
+        let link = |((w, b), (stride, relu)): (&(Var, Var), (usize, bool))| Link {
+            weight: w.as_tensor().clone(),
+            bias: Some(b.as_tensor().clone()),
+            opts: Conv3x3 { stride, relu, precision, ..Conv3x3::default() },
+        };
+        let kinds = [(1, true), (2, true), (1, true), (1, false)];
+        let y = conv_chain(&x, &params.iter().zip(kinds).map(link).collect::<Vec<_>>())?;
+        let grads = y.sqr()?.sum_all()?.backward()?;
+        let vars = params.iter().flat_map(|(w, b)| [w, b]).chain([&x]);
+        let flat = vars.map(|v| grads.get(v).expect("a gradient for every variable").flatten_all()?.to_vec1::<f32>());
+        Ok(flat.collect::<Result<Vec<_>>>()?.concat())
+    };
+    let exact = gradients(Precision::F32)?;
+    let found = gradients(Precision::Bf16)?;
+    let norm = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let both = exact.iter().zip(&found).map(|(&a, &b)| f64::from(a - b)).collect::<Vec<_>>();
+    let error = norm(&both) / norm(&exact.iter().map(|&v| v.into()).collect::<Vec<_>>());
+    println!("relative error of the gradient in bf16: {error:.2e}");
+    assert!(error < 2e-2, "{error}");
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    assert!(one.install(|| gradients(Precision::Bf16))? == found);
     Ok(())
 }
 
@@ -461,7 +524,7 @@ fn other_types_take_candles_path() -> Result<()> {
 #[test]
 fn broken_rules_are_named() -> Result<()> {
     let new = |w: usize, i, o, stride, groups| {
-        let opts = Conv3x3 { stride, groups, relu: false };
+        let opts = Conv3x3 { stride, groups, ..Conv3x3::default() };
         PackedConv::new(&vec![0.0; w], None, i, o, opts).map(drop).unwrap_err().to_string()
     };
     assert_eq!(new(9, 1, 1, 3, 1), "stride 3; it can be 1 or 2");

@@ -39,6 +39,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
         training: TrainingConfig {
             steps,
             optimizer: Optimizer::Muon,
+            precision: Precision::F32,
             loss: Loss::L1,
             learning_rate: 2e-3,
             final_learning_rate: 0.0,

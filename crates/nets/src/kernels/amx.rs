@@ -2,7 +2,8 @@
 //!
 //! A number is the sum of two bf16 ones, `x = hi + lo` to 17 bits, and a product of three of theirs,
 //! `hi·hi + hi·lo + lo·hi`. An image in that form ([`Form::Split`]) has the size of one in f32: for 32 channels one
-//! cache line of `hi` and one of `lo`, so that 16 neighbouring pixels are a tile where they lie.
+//! cache line of `hi` and one of `lo`, so that 16 neighbouring pixels are a tile where they lie. Without `lo`
+//! ([`Form::Half`]) it has half the size, and a product is one.
 
 use super::blocked::{Form, Pixel, View, ViewMut, ZERO};
 use super::conv::Store;
@@ -50,8 +51,10 @@ fn permitted() -> bool {
 pub(super) struct Amx {
     pairs: usize,
     stride: usize,
+    /// Of the images that it is given: [`Form::Split`] or [`Form::Half`].
+    pub(super) form: Form,
     panels: Vec<Panel>,
-    /// For each panel `[9][pairs][lo, hi][vecs]` tiles of `[16 pairs of channels][16 outputs][2]`.
+    /// For each panel `[9][pairs][lo, hi][vecs]` (in halves only `hi`) tiles of `[16 pairs of channels][16 outputs][2]`.
     filters: Vec<Pixel>,
 }
 
@@ -69,20 +72,21 @@ fn from_bf16(x: u16) -> f32 {
 }
 
 impl Amx {
-    pub(super) fn new(weights: &Weights<'_>, step: Step) -> Self {
+    pub(super) fn new(weights: &Weights<'_>, step: Step, form: Form) -> Self {
+        let parts: &[bool] = if form == Form::Half { &[false] } else { &[true, false] };
         let pairs = weights.inputs.div_ceil(PAIR);
         let panels = Panel::cut(weights.outputs, 2);
         let mut filters = Vec::with_capacity(9 * pairs * 2 * ROWS * weights.outputs.div_ceil(LANES));
         for &panel in &panels {
             for (tap, pair) in (0..9).flat_map(|tap| (0..pairs).map(move |pair| (tap, pair))) {
-                for low in [true, false] {
+                for &low in parts {
                     for block in panel.block..panel.block + panel.vecs {
                         filters.extend((0..ROWS).map(|row| tile_row(weights, tap, pair * PAIR + 2 * row, block, low)));
                     }
                 }
             }
         }
-        Self { pairs, stride: if step == Step::Half { 2 } else { 1 }, panels, filters }
+        Self { pairs, stride: if step == Step::Half { 2 } else { 1 }, form, panels, filters }
     }
 }
 
@@ -99,7 +103,7 @@ fn tile_row(weights: &Weights<'_>, tap: usize, c: usize, block: usize, low: bool
 
 /// Shape of the tiles: 8 of 16 rows of 64 bytes.
 #[repr(C, align(64))]
-struct TileConfig {
+pub(super) struct TileConfig {
     palette: u8,
     start_row: u8,
     reserved: [u8; 14],
@@ -107,7 +111,7 @@ struct TileConfig {
     rows: [u8; 16],
 }
 
-static TILES: TileConfig = {
+pub(super) static TILES: TileConfig = {
     let (mut row_bytes, mut rows) = ([0; 16], [0; 16]);
     let mut i = 0;
     while i < 8 {
@@ -120,16 +124,17 @@ static TILES: TileConfig = {
 /// Results of 32 pixels × 2 blocks of outputs.
 type Results = [Pixel; 2 * PAIR];
 
-/// Convolves a strip of a split image.
+/// Convolves a strip of a split or halved image.
 ///
 /// # Safety
 /// [`available`]; the strip's memory is valid, and that of its input 96 pixels beyond its last row.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Strip, store: Store, slot: &mut Slot) {
     let Strip { src, dst, rows, width } = strip;
+    let parts = if conv.form == Form::Half { 1 } else { 2 };
     slot.runs.clear();
     for (tap, pair) in (0..9).flat_map(|tap| (0..conv.pairs).map(move |pair| (tap, pair))) {
-        let offset = 2 * pair * src.block + tap / 3 * src.row + tap % 3 * LANES;
+        let offset = parts * pair * src.block + tap / 3 * src.row + tap % 3 * LANES;
         slot.runs.push(Run { offset, len: PAIR });
     }
     let mut buffers: [Results; 2] = [[ZERO; 2 * PAIR]; 2];
@@ -141,33 +146,34 @@ pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Stri
         for &panel in &conv.panels {
             let bias = bias.as_ptr().add(panel.block);
             let place = Place::new(store, panel, conv.panels.len(), floor, dst);
+            let multiply = match (panel.vecs, conv.form) {
+                (2, Form::Half) => multiply::<2, true>,
+                (_, Form::Half) => multiply::<1, true>,
+                (2, _) => multiply::<2, false>,
+                _ => multiply::<1, false>,
+            };
             let mut previous = Pending { place: &place, results: first, y: 0, x: 0, count: 0, done: 0 };
             let mut next = second;
             for y in 0..rows {
                 for x in (0..width).step_by(PAIR) {
                     let a = src.ptr.add(conv.stride * (y * src.row + x * LANES));
-                    if panel.vecs == 2 {
-                        multiply::<2>(a, conv.stride, src.block, &slot.runs, filters, bias, next, &mut previous);
-                    } else {
-                        multiply::<1>(a, conv.stride, src.block, &slot.runs, filters, bias, next, &mut previous);
-                    }
+                    multiply(a, conv.stride, src.block, &slot.runs, filters, bias, next, &mut previous);
                     let results = std::mem::replace(&mut next, previous.results);
                     previous = Pending { place: &place, results, y, x, count: PAIR.min(width - x), done: 0 };
                 }
             }
             previous.advance(PAIR);
-            filters = filters.add(slot.runs.len() * 2 * panel.vecs * ROWS);
+            filters = filters.add(slot.runs.len() * parts * panel.vecs * ROWS);
         }
         asm!("tilerelease", options(nostack, nomem));
     }
 }
 
-/// `results[pixel][v] = bias + Σ` over the runs of 32 pixels from `a` on, `low` floats from `hi` to `lo`. Meanwhile the
-/// vector unit puts the previous pixels in their place.
-#[inline]
+/// `results[pixel][v] = bias + Σ` over the runs of 32 pixels from `a` on, `low` floats from `hi` to `lo` unless `HALF`.
+/// Meanwhile the vector unit puts the previous pixels in their place.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 #[allow(clippy::too_many_arguments)]
-unsafe fn multiply<const V: usize>(
+unsafe fn multiply<const V: usize, const HALF: bool>(
     a: *const f32,
     stride: usize,
     low: usize,
@@ -191,7 +197,25 @@ unsafe fn multiply<const V: usize>(
         for run in runs {
             let p = a.add(run.offset);
             let q = p.add(ROWS * stride * LANES);
-            if V == 2 {
+            if HALF {
+                asm!(
+                    "tileloadd tmm4, [{p} + {s}*1]",
+                    "tileloadd tmm5, [{q} + {s}*1]",
+                    "tileloadd tmm6, [{w} + {t}*1]",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm2, tmm5, tmm6",
+                    p = in(reg) p, q = in(reg) q, s = in(reg) bytes, w = in(reg) filters, t = in(reg) 64usize,
+                    options(nostack, readonly),
+                );
+                if V == 2 {
+                    asm!(
+                        "tileloadd tmm7, [{w} + {t}*1 + 1024]",
+                        "tdpbf16ps tmm1, tmm4, tmm7",
+                        "tdpbf16ps tmm3, tmm5, tmm7",
+                        w = in(reg) filters, t = in(reg) 64usize, options(nostack, readonly),
+                    );
+                }
+            } else if V == 2 {
                 asm!(
                     "tileloadd tmm4, [{p} + {s}*1]",
                     "tileloadd tmm5, [{q} + {s}*1]",
@@ -234,7 +258,7 @@ unsafe fn multiply<const V: usize>(
                     s = in(reg) bytes, w = in(reg) filters, t = in(reg) 64usize, options(nostack, readonly),
                 );
             }
-            filters = filters.add(2 * V * ROWS);
+            filters = filters.add(if HALF { V * ROWS } else { 2 * V * ROWS });
             previous.advance(each);
         }
         let r = results.cast::<Pixel>();
@@ -263,6 +287,7 @@ impl Place {
         let ViewMut { ptr, block, row } = dst;
         let vecs = panel.vecs;
         let (first, row, step) = match store {
+            Store::As(Form::Half) => (panel.block / 2 * block, row, LANES),
             Store::As(_) => (panel.block * block, row, LANES),
             Store::AddShuffled => {
                 let (pair, each) = (panel.block / 2, panels / 4);
@@ -312,6 +337,7 @@ impl Pending<'_> {
                         }
                     }
                     Store::As(Form::Split) => store_split(a, b, out, out.add(second)),
+                    Store::As(Form::Half) => _mm512_storeu_si512(out.cast(), rounded(a, b)),
                     Store::AddShuffled => {
                         let [high, low] = [out, out.add(second)].map(|p| widen(_mm512_loadu_si512(p.cast())));
                         let a = _mm512_add_ps(a, _mm512_add_ps(high.0, low.0));
@@ -328,7 +354,7 @@ impl Pending<'_> {
 /// 32 bf16 numbers as f32.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw")]
-fn widen(x: __m512i) -> (__m512, __m512) {
+pub(super) fn widen(x: __m512i) -> (__m512, __m512) {
     let half = |x: __m256i| _mm512_castsi512_ps(_mm512_slli_epi32::<16>(_mm512_cvtepu16_epi32(x)));
     (half(_mm512_castsi512_si256(x)), half(_mm512_extracti64x4_epi64::<1>(x)))
 }
@@ -337,16 +363,22 @@ fn widen(x: __m512i) -> (__m512, __m512) {
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 unsafe fn store_split(a: __m512, b: __m512, high: *mut f32, low: *mut f32) {
-    // SAFETY: both types are 64 bytes of any content.
-    let bits = |x: __m512bh| unsafe { std::mem::transmute::<__m512bh, __m512i>(x) };
-    let rounded = bits(_mm512_cvtne2ps_pbh(b, a));
-    let (high_a, high_b) = widen(rounded);
-    let rest = bits(_mm512_cvtne2ps_pbh(_mm512_sub_ps(b, high_b), _mm512_sub_ps(a, high_a)));
+    let nearest = rounded(a, b);
+    let (high_a, high_b) = widen(nearest);
+    let rest = rounded(_mm512_sub_ps(a, high_a), _mm512_sub_ps(b, high_b));
     // SAFETY: the caller gives the memory.
     unsafe {
-        _mm512_storeu_si512(high.cast(), rounded);
+        _mm512_storeu_si512(high.cast(), nearest);
         _mm512_storeu_si512(low.cast(), rest);
     }
+}
+
+/// 32 numbers as bf16.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+pub(super) fn rounded(a: __m512, b: __m512) -> __m512i {
+    // SAFETY: both types are 64 bytes of any content.
+    unsafe { std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(b, a)) }
 }
 
 /// Splits `count` pixels of `channels` channels in a row; `src` and `dst` may be the same. Whatever the lanes beyond the

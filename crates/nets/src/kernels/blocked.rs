@@ -19,6 +19,8 @@ pub(crate) enum Form {
     Single,
     /// Two bf16 numbers whose sum it is to 17 bits; 32 channels in two blocks, the second for what the first lacks.
     Split,
+    /// One bf16 number each, 32 channels a block: what training in bf16 keeps.
+    Half,
 }
 
 /// Pixels after the last one: tiles of the matrix unit end where a row does only if it has whole ones.
@@ -26,7 +28,8 @@ pub(super) const SLACK: usize = 96;
 
 /// One image of any number of channels as `[⌈C/16⌉][1 + ⌈H⌉₄ + 1][1 + ⌈W⌉₄ + 1][16]` (`⌈·⌉₄`: up to a multiple of 4).
 ///
-/// For the matrix unit two blocks hold 32 channels as pairs of bf16 numbers instead ([`Form::Split`]).
+/// For the matrix unit two blocks hold 32 channels as pairs of bf16 numbers instead ([`Form::Split`]), or one block 32 as bf16
+/// ([`Form::Half`]).
 ///
 /// The border is zero, so that a 3×3 filter, or a Winograd tile of 6×6, never has to look where it is. The lanes beyond
 /// the last channel hold nothing: kernels write zeros there and never read them.
@@ -86,16 +89,27 @@ impl Blocked {
         self.data.len() * size_of::<Pixel>()
     }
 
+    /// All pixels with their border, block by block.
+    pub(super) fn pixels(&self) -> &[Pixel] {
+        &self.data
+    }
+
+    /// As [`Blocked::pixels`], to write.
+    pub(super) fn pixels_mut(&mut self) -> &mut [Pixel] {
+        &mut self.data
+    }
+
     /// Number of channel blocks, `⌈C/16⌉`.
     pub fn blocks(&self) -> usize {
         match self.form {
             Form::Single => self.channels.div_ceil(LANES),
             Form::Split => 2 * self.channels.div_ceil(2 * LANES),
+            Form::Half => self.channels.div_ceil(2 * LANES),
         }
     }
 
     fn first_pixel(&self, block: usize, y: usize) -> usize {
-        assert_eq!(self.form, Form::Single, "the numbers of a split image");
+        assert_eq!(self.form, Form::Single, "the numbers of an image for the matrix unit");
         assert!(
             block < self.blocks() && y < self.height,
             "block {block}, row {y} of {} blocks, {} rows",

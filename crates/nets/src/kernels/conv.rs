@@ -5,7 +5,7 @@ use super::amx;
 use super::blocked::{Blocked, Form, Pixel, SLACK, View, ViewMut, ZERO, padded};
 use super::scratch::{Scratch, Slot};
 use super::simd::{Isa, LANES};
-use super::{KernelError, Step, Strip, Weights, direct, winograd};
+use super::{KernelError, Precision, Step, Strip, Weights, direct, winograd};
 
 #[derive(Debug)]
 enum Filters {
@@ -72,7 +72,7 @@ impl PackedConv {
     ) -> Result<Self, KernelError> {
         let step = Step::of_stride(opts.stride)?;
         let weights = Weights::new(weights, inputs, outputs, opts.groups)?;
-        let mut conv = Self::pack(isa.checked()?, &weights, step);
+        let mut conv = Self::pack(isa.checked()?, &weights, step, opts.precision);
         if let Some(bias) = bias {
             super::blocked::check_len(outputs, bias.len())?;
             for (o, &b) in bias.iter().enumerate() {
@@ -86,11 +86,15 @@ impl PackedConv {
     }
 
     /// Without bias and ReLU; `isa` is available.
-    pub(super) fn pack(isa: Isa, weights: &Weights<'_>, step: Step) -> Self {
+    pub(super) fn pack(isa: Isa, weights: &Weights<'_>, step: Step, precision: Precision) -> Self {
         let (inputs, outputs) = (weights.inputs, weights.outputs);
         let filters = match isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Amx if prefers_matrix_unit(inputs, weights.groups, step) => Filters::Amx(amx::Amx::new(weights, step)),
+            Isa::Amx if precision == Precision::Bf16 => Filters::Amx(amx::Amx::new(weights, step, Form::Half)),
+            #[cfg(target_arch = "x86_64")]
+            Isa::Amx if prefers_matrix_unit(inputs, weights.groups, step) => {
+                Filters::Amx(amx::Amx::new(weights, step, Form::Split))
+            }
             _ if prefers_winograd(inputs, outputs, weights.groups, step) => {
                 Filters::Winograd(winograd::Winograd::new(weights, isa.vecs()))
             }
@@ -108,7 +112,7 @@ impl PackedConv {
         }
     }
 
-    /// Gives its result in that form; [`Form::Split`] is for [`Isa::Amx`].
+    /// Gives its result in that form; any but [`Form::Single`] is for [`Isa::Amx`].
     pub(crate) fn giving(self, form: Form) -> Self {
         debug_assert!(form == Form::Single || self.isa == Isa::Amx, "{:?} has no split images", self.isa);
         Self { form, ..self }
@@ -120,9 +124,9 @@ impl PackedConv {
 
     /// The form in which it multiplies its input.
     fn input_form(&self) -> Form {
-        match self.filters {
+        match &self.filters {
             #[cfg(target_arch = "x86_64")]
-            Filters::Amx(_) => Form::Split,
+            Filters::Amx(amx) => amx.form,
             _ => Form::Single,
         }
     }
@@ -223,10 +227,11 @@ impl PackedConv {
     fn check_image(&self, input: &Blocked) -> Result<(), KernelError> {
         let (channels, height, width) = input.shape();
         self.check(channels, [1, channels, height, width])?;
-        if input.form() == Form::Split && self.input_form() == Form::Single {
-            return Err(KernelError::Form);
+        match (input.form(), self.input_form()) {
+            (Form::Single, Form::Split) => Ok(()),
+            (given, wanted) if given == wanted => Ok(()),
+            _ => Err(KernelError::Form),
         }
-        Ok(())
     }
 
     fn check(&self, channels: usize, shape: [usize; 4]) -> Result<(), KernelError> {

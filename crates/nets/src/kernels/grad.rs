@@ -3,8 +3,10 @@
 //! The batch is cut into chunks of strips, as many as the shape alone says; each chunk is summed by one worker in order,
 //! and the chunks' sums are added in order, so that the result does not depend on the number of threads.
 
-use super::blocked::{Blocked, Pixel, ZERO};
+use super::blocked::{Blocked, Form, Pixel, ZERO};
 use super::conv::{prefers_winograd, strip_rows};
+#[cfg(target_arch = "x86_64")]
+use super::half;
 use super::scratch::Scratch;
 use super::simd::{Isa, LANES};
 use super::{GradStrip, KernelError, Step, Weights, direct, winograd};
@@ -17,10 +19,37 @@ const MAX_CHUNKS: usize = 8;
 enum Plan {
     Winograd(winograd::GradPlan),
     Direct(direct::GradPlan),
+    #[cfg(target_arch = "x86_64")]
+    Half(half::GradPlan),
+}
+
+impl Plan {
+    fn new(isa: Isa, form: Form, shape: &Weights<'_>, step: Step) -> Self {
+        let Weights { inputs, outputs, groups, .. } = *shape;
+        match form {
+            #[cfg(target_arch = "x86_64")]
+            Form::Half => Self::Half(half::GradPlan::new(inputs, outputs)),
+            _ if prefers_winograd(inputs, outputs, groups, step) => {
+                Self::Winograd(winograd::GradPlan::new(inputs, outputs, isa.vecs()))
+            }
+            _ => Self::Direct(direct::GradPlan::new(shape, step, isa.vecs())),
+        }
+    }
+
+    /// Cache lines of the sums of the bias, and of the weights.
+    fn pixels(&self, outputs: usize) -> (usize, usize) {
+        match self {
+            Self::Winograd(p) => (outputs.div_ceil(LANES), p.pixels),
+            Self::Direct(p) => (outputs.div_ceil(LANES), p.pixels),
+            #[cfg(target_arch = "x86_64")]
+            Self::Half(p) => (p.bias_pixels(), p.pixels),
+        }
+    }
 }
 
 /// `∂w[o,i] = Σ_n ∂y[n,o] ⋆ x[n,i]` as `[Cout, Cin/groups, 3, 3]`, and `∂b[o] = Σ ∂y[n,o]`, of as many images `grads` of ∂y
-/// as `x` of the input; `(inputs, outputs, groups)` are those of the convolution.
+/// as `x` of the input, all of the same form; `(inputs, outputs, groups)` are those of the convolution. Halved images are of
+/// stride 1.
 pub(super) fn weight_grad(
     isa: Isa,
     x: &[&Blocked],
@@ -31,19 +60,11 @@ pub(super) fn weight_grad(
 ) -> Result<(Vec<f32>, Vec<f32>), KernelError> {
     let mut result = vec![0.0; outputs * (inputs / groups) * 9];
     let weights = Weights::new(&result, inputs, outputs, groups)?;
-    let plan = if prefers_winograd(inputs, outputs, groups, step) {
-        Plan::Winograd(winograd::GradPlan::new(inputs, outputs, isa.vecs()))
-    } else {
-        Plan::Direct(direct::GradPlan::new(&weights, step, isa.vecs()))
-    };
-    let blocks = outputs.div_ceil(LANES);
-    let pixels = blocks
-        + match &plan {
-            Plan::Winograd(p) => p.pixels,
-            Plan::Direct(p) => p.pixels,
-        };
+    let (form, (_, out_h, out_w)) = grads.first().map_or_else(Default::default, |g| (g.form(), g.shape()));
+    let plan = Plan::new(isa, form, &weights, step);
+    let (blocks, pixels) = plan.pixels(outputs);
+    let pixels = blocks + pixels;
 
-    let (_, out_h, out_w) = grads.first().map_or((0, 0, 0), |g| g.shape());
     let each = strip_rows(out_w);
     let strips = out_h.div_ceil(each);
     let jobs = grads.len() * strips;
@@ -65,10 +86,17 @@ pub(super) fn weight_grad(
             };
             // SAFETY: both images have the strip, a border and whole tiles; `isa` is available.
             unsafe {
-                add_bias(bias, &strip);
                 match &plan {
-                    Plan::Winograd(p) => winograd::weight_grad(isa, p, weights, strip, slot),
-                    Plan::Direct(p) => direct::weight_grad(isa, p, weights, strip),
+                    Plan::Winograd(p) => {
+                        add_bias(bias, &strip);
+                        winograd::weight_grad(isa, p, weights, strip, slot);
+                    }
+                    Plan::Direct(p) => {
+                        add_bias(bias, &strip);
+                        direct::weight_grad(isa, p, weights, strip);
+                    }
+                    #[cfg(target_arch = "x86_64")]
+                    Plan::Half(p) => half::weight_grad(p, bias, weights, strip, slot),
                 }
             }
         }
@@ -80,12 +108,12 @@ pub(super) fn weight_grad(
             winograd::add(total, other.pixels());
         }
         let (_, total) = total.split_at(blocks);
+        let shape = Weights { data: &[], ..weights };
         match &plan {
             Plan::Winograd(p) => p.finish(total, &mut result),
-            Plan::Direct(p) => {
-                let shape = Weights { data: &[], ..weights };
-                p.finish(&shape, total, &mut result);
-            }
+            Plan::Direct(p) => p.finish(&shape, total, &mut result),
+            #[cfg(target_arch = "x86_64")]
+            Plan::Half(p) => p.finish(&shape, total, &mut result),
         }
     }
     let bias = buffers[..chunks].iter_mut().take(1).flat_map(|b| b.pixels()[..blocks].iter().flat_map(|b| b.0));

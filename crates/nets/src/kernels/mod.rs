@@ -91,6 +91,8 @@ mod blocked;
 mod conv;
 mod direct;
 mod grad;
+#[cfg(target_arch = "x86_64")]
+mod half;
 mod memory;
 mod op;
 mod peak;
@@ -102,7 +104,7 @@ mod winograd;
 pub use blocked::Blocked;
 pub use conv::PackedConv;
 pub use memory::keep_freed_memory;
-pub use op::{Conv3x3, Link, conv_chain, conv3x3, conv3x3_on};
+pub use op::{Conv3x3, Link, Precision, conv_chain, conv3x3, conv3x3_on};
 pub use peak::gemm_peak;
 pub use scratch::Scratch;
 pub use simd::{Isa, LANES};
@@ -136,8 +138,8 @@ pub enum KernelError {
         /// Of the image.
         found: usize,
     },
-    /// The image is in the form of the matrix unit, the convolution is not for it.
-    #[error("a split image goes into a convolution of f32 numbers")]
+    /// The image is in a form of the matrix unit that the convolution is not for.
+    #[error("an image for the matrix unit goes into a convolution for another form")]
     Form,
     /// The stride is neither 1 nor 2.
     #[error("stride {0}; it can be 1 or 2")]

@@ -1,6 +1,6 @@
 //! Memory that calls reuse, and how work is shared out.
 
-use super::blocked::{Blocked, Pixel, ZERO};
+use super::blocked::{Blocked, Form, Pixel, ZERO};
 use super::simd::LANES;
 use super::tile::Run;
 use rayon::prelude::*;
@@ -100,12 +100,13 @@ const MOST_KEPT: usize = 1 << 30;
 
 impl Images {
     /// An image whose border is zero and whose pixels are unspecified.
-    pub(super) fn take(&self, shape: (usize, usize, usize)) -> Blocked {
+    pub(super) fn take(&self, form: Form, shape: (usize, usize, usize)) -> Blocked {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
         // The last are the likeliest to be in a cache.
-        let found = free.iter().rposition(|image| image.shape() == shape).map(|i| free.swap_remove(i));
+        let found =
+            free.iter().rposition(|image| (image.form(), image.shape()) == (form, shape)).map(|i| free.swap_remove(i));
         drop(free);
-        found.unwrap_or_else(|| Blocked::zeros(shape.0, shape.1, shape.2))
+        found.unwrap_or_else(|| Blocked::of(form, shape))
     }
 
     /// Takes images back.

@@ -12,6 +12,7 @@ mod noise;
 mod step;
 mod unrolled;
 
+pub use crate::kernels::Precision;
 pub use adam::Adam;
 pub use config::{
     CheckpointConfig, DataConfig, IteratesConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig,

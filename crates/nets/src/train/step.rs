@@ -212,6 +212,7 @@ impl Trainer {
         config.validate()?;
         data.check(config.network.channels(), config.data.photo_share)?;
         let mut model = Model::random(&config.network, config.seed)?;
+        model.network_mut().set_precision(config.training.precision);
         let vars = model.network_mut().make_trainable()?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
