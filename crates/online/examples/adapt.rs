@@ -9,6 +9,7 @@
 use admm::{Gap, Plan, Problem, Stage, Start, run};
 use ndarray::{Array3, Axis, s};
 use ndarray_npy::NpzReader;
+use nets::kernels::Precision;
 use nets::{Ffdnet, Network};
 use online::{
     AdaptConfig, AdaptiveDenoiser, Outcome, Parameters, Reuse, Schedule, SequenceConfig, Snapshot, run_sequence,
@@ -31,7 +32,7 @@ struct Settings {
 
 fn set(settings: &mut Settings, key: &str, value: &str) -> Result<(), Box<dyn Error>> {
     let Settings { adapt, sequence, stages, measurements, plain } = settings;
-    let AdaptConfig { schedule, parameters, terms, guard, blind, seed } = adapt;
+    let AdaptConfig { schedule, parameters, terms, guard, blind, precision, seed } = adapt;
     match key {
         "first" => schedule.first = value.parse()?,
         "interval" => schedule.interval = value.parse()?,
@@ -58,6 +59,7 @@ fn set(settings: &mut Settings, key: &str, value: &str) -> Result<(), Box<dyn Er
         "back_off" => guard.back_off = value.parse()?,
         "patience" => guard.patience = value.parse()?,
         "blind" => *blind = Some(value.parse()?),
+        "precision" => *precision = if value == "bf16" { Precision::Bf16 } else { Precision::F32 },
         "plain" => *plain = value.parse()?,
         "seed" => *seed = value.parse()?,
         "carry_over" => sequence.reuse = if value.parse()? { Reuse::CarryOver } else { Reuse::Reset },

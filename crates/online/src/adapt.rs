@@ -83,8 +83,9 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
     ///
     /// # Errors
     /// [`Error::Setting`].
-    pub fn new(net: N, config: AdaptConfig) -> Result<Self> {
+    pub fn new(mut net: N, config: AdaptConfig) -> Result<Self> {
         config.validate()?;
+        net.set_precision(config.precision);
         let pretrained = net.state();
         Ok(Self {
             net,

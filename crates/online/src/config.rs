@@ -2,6 +2,7 @@
 
 use crate::{Error, Result, Schedule};
 use nets::Parameters;
+use nets::kernels::Precision;
 
 /// How a denoiser adapts.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,6 +19,8 @@ pub struct AdaptConfig {
     /// out ([`Pixels::blinded`](crate::Pixels::blinded)). Nothing: the paper's loss, which sees all that are not held
     /// out, with an input that holds them.
     pub blind: Option<f64>,
+    /// What gradients are computed in; the network denoises as ever.
+    pub precision: Precision,
     /// Of everything random: pixels held out, noise, flips.
     pub seed: u64,
 }
@@ -30,6 +33,7 @@ impl AdaptConfig {
         terms: Terms::NONE,
         guard: Guard::OFF,
         blind: None,
+        precision: Precision::F32,
         seed: 42,
     };
     /// The paper's code with FastDVDnet.
@@ -83,7 +87,7 @@ impl Default for AdaptConfig {
             growth: 100.0,
             ..Schedule::PAPER_FFDNET
         };
-        Self { schedule, guard: Guard::ON, ..Self::PAPER_FFDNET }
+        Self { schedule, guard: Guard::ON, precision: Precision::Bf16, ..Self::PAPER_FFDNET }
     }
 }
 

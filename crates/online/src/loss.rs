@@ -330,7 +330,7 @@ fn propagate(
 }
 
 /// Rows of a strip: the more, the less is computed twice; the fewer, the less memory.
-const STRIP: usize = 192;
+const STRIP: usize = 48;
 
 /// Rows whose results are looked at, and those around them that they depend on.
 struct Strip {

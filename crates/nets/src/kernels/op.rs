@@ -407,13 +407,12 @@ impl CustomOp2 for Chain {
             return Err(Error::wrap(KernelError::Empty([n, c, h, w])));
         }
         let (x, params) = (numbers(x, x_layout)?, numbers(params, params_layout)?);
-        let layers = self.layers.iter();
         let last = self.layers.len() - 1;
         let packed = |(i, layer): (usize, &Layer)| {
             let form = if i == last { Form::Single } else { self.form };
             layer.packed(self.isa, params).map(|conv| conv.giving(form))
         };
-        let convs: Vec<_> = layers.enumerate().map(packed).collect::<Checked<_>>().map_err(Error::wrap)?;
+        let convs = self.layers.par_iter().enumerate().map(packed).collect::<Checked<Vec<_>>>().map_err(Error::wrap)?;
         let shape = convs.iter().fold((c, h, w), |(_, h, w), conv| conv.out_shape(h, w));
         let each = shape.0 * shape.1 * shape.2;
         let mut y = vec![0.0; n * each];

@@ -183,6 +183,7 @@ pub struct OnlineKeys {
     pub growth: Value,
     pub keep_optimizer: Value,
     pub parameters: Value,
+    pub precision: Value,
     pub pseudo_clean: Value,
     pub distance: Value,
     pub equivariance: Value,

@@ -430,6 +430,7 @@ fn online_json(o: &Online) -> Value {
         "growth": schedule.growth,
         "keep_optimizer": schedule.keep_optimizer,
         "parameters": o.adapt.parameters,
+        "precision": o.adapt.precision,
         "pseudo_clean": terms.pseudo_clean,
         "distance": terms.distance,
         "equivariance": terms.equivariance,
