@@ -2,7 +2,7 @@
 //! and a network's activations are those of one frame.
 
 use crate::Result;
-use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Scratch};
+use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Precision, Scratch};
 use crate::layers::Conv;
 
 /// Packed convolutions and the images between them.
@@ -20,21 +20,25 @@ impl Engine {
     pub(crate) fn new(convs: &[&Conv], shuffled: &[usize]) -> Result<Self> {
         let isa = Isa::detect()?;
         let pack = |(i, conv): (usize, &&Conv)| {
-            let opts = conv.opts();
+            let opts = conv.inference();
             let mut filters = Filters::new(conv)?;
-            if i > 0 && convs[i - 1].opts().groups > 1 {
-                filters.spread_inputs(convs[i - 1].opts().groups);
+            if i > 0 && convs[i - 1].inference().groups > 1 {
+                filters.spread_inputs(convs[i - 1].inference().groups);
             }
             if opts.groups > 1 {
                 filters.spread_outputs(opts.groups);
             }
             if shuffled.contains(&i) {
-                let block = if form(isa, filters.outputs / 4) == Form::Split { 2 * LANES } else { LANES };
-                filters.order_by_phase(block);
+                let single = form(isa, opts.precision, filters.outputs / 4) == Form::Single;
+                filters.order_by_phase(if single { LANES } else { 2 * LANES });
             }
             let Filters { inputs, outputs, values, bias } = filters;
+            let form = |channels: usize| form(isa, opts.precision, channels);
+            // What the matrix unit would not gain from stays in f32, as the input of the first layer does.
+            let precision = if form(inputs) == Form::Half { Precision::Bf16 } else { Precision::F32 };
+            let opts = Conv3x3 { precision, ..opts };
             let packed = PackedConv::new_on(isa, &values, bias.as_deref(), inputs, outputs, opts)?;
-            Ok((if shuffled.contains(&i) { packed } else { packed.giving(form(isa, outputs)) }, opts))
+            Ok((if shuffled.contains(&i) { packed } else { packed.giving(form(outputs)) }, opts))
         };
         Ok(Self { convs: convs.iter().enumerate().map(pack).collect::<Result<_>>()?, ..Self::default() })
     }
@@ -76,7 +80,7 @@ impl Engine {
 
     /// Adds the pixel-shuffled result of layer `i` to `image`; the input is taken back.
     pub(crate) fn add_shuffled(&mut self, i: usize, input: Blocked, image: &mut Blocked) -> Result<()> {
-        if image.form() == Form::Split {
+        if image.form() != Form::Single {
             self.convs[i].0.add_shuffled(&input, image, &mut self.scratch)?;
         } else {
             let quarters = self.conv(i, &input)?;
@@ -126,9 +130,13 @@ impl Cache {
     }
 }
 
-/// How the images between layers are held: split for the matrix unit, but for those that it would not gain from.
-fn form(isa: Isa, channels: usize) -> Form {
-    if isa == Isa::Amx && channels > LANES { Form::Split } else { Form::Single }
+/// How the images between layers are held: split or halved for the matrix unit, but for those that it would not gain from.
+fn form(isa: Isa, precision: Precision, channels: usize) -> Form {
+    match precision {
+        _ if isa != Isa::Amx || channels <= LANES => Form::Single,
+        Precision::F32 => Form::Split,
+        Precision::Bf16 => Form::Half,
+    }
 }
 
 /// A layer's filters `[Cout, Cin/groups, 3, 3]`, batch norm folded, to be put in the order that suits the kernels.
@@ -145,7 +153,7 @@ impl Filters {
         let (outputs, each, ..) = weight.dims4()?;
         let values = weight.flatten_all()?.to_vec1::<f32>()?;
         let bias = bias.map(|b| b.to_vec1::<f32>()).transpose()?;
-        Ok(Self { inputs: each * conv.opts().groups, outputs, values, bias })
+        Ok(Self { inputs: each * conv.inference().groups, outputs, values, bias })
     }
 
     /// Fills up the outputs of each group with zeros to whole pairs of blocks, so that no panel of outputs has the

@@ -43,6 +43,8 @@ struct BatchNorm {
 pub struct Conv {
     name: String,
     opts: Conv3x3,
+    /// What inference multiplies, whatever `opts` says.
+    inference: Precision,
     weight: Tensor,
     bias: Option<Tensor>,
     norm: Option<BatchNorm>,
@@ -84,12 +86,17 @@ impl Conv {
             }),
             _ => None,
         };
-        Ok(Self { name, opts, weight, bias, norm })
+        Ok(Self { name, opts, inference: Precision::F32, weight, bias, norm })
     }
 
-    /// How inference does the layer, in f32 always.
-    pub(crate) fn opts(&self) -> Conv3x3 {
-        Conv3x3 { precision: Precision::F32, ..self.opts }
+    /// How inference does the layer.
+    pub(crate) fn inference(&self) -> Conv3x3 {
+        Conv3x3 { precision: self.inference, ..self.opts }
+    }
+
+    /// What the layer multiplies in inference.
+    pub(crate) fn set_inference_precision(&mut self, precision: Precision) {
+        self.inference = precision;
     }
 
     /// What the differentiable layer multiplies.

@@ -75,8 +75,13 @@ pub trait Network: Send + Sync {
     #[doc(hidden)]
     fn convs_mut(&mut self) -> Vec<&mut Conv>;
 
+    /// What inference, as a denoiser on the CPU, multiplies: f32 unless this asks for [`Precision::Bf16`].
+    fn set_inference_precision(&mut self, precision: Precision) {
+        self.convs_mut().into_iter().for_each(|conv| conv.set_inference_precision(precision));
+    }
+
     /// What [`Network::forward`] and the gradient multiply: f32 unless this asks for [`Precision::Bf16`]. Inference
-    /// (as a denoiser) is not changed by it.
+    /// is not changed by it.
     fn set_precision(&mut self, precision: Precision) {
         self.convs_mut().into_iter().for_each(|conv| conv.set_precision(precision));
     }

@@ -3,7 +3,7 @@
 use admm::{DenoiseCx, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array3, Array4, Axis, concatenate, s};
-use nets::kernels::Isa;
+use nets::kernels::{Isa, Precision};
 use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
     Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, WeightFile,
@@ -12,6 +12,10 @@ use sci_forward::bayer::{Malvar, mosaic_into};
 use sci_forward::testing::{gaussian, shared_file};
 use sci_forward::{CfaPattern, Demosaicer};
 use std::path::{Path, PathBuf};
+
+/// Both in one object.
+trait NetworkDenoiser: Network + Denoiser {}
+impl<N: Network + Denoiser> NetworkDenoiser for N {}
 
 const CX: DenoiseCx = DenoiseCx { sigma: 0.1, iteration: 0, stage: 0 };
 
@@ -103,6 +107,33 @@ fn wide_networks_pass_on_every_instruction_set() {
             .output()
             .unwrap();
         assert!(run.status.success(), "{isa:?}: {}", String::from_utf8_lossy(&run.stdout));
+    }
+}
+
+/// Strides, groups, shuffles and skips of wide networks in bf16; elsewhere than on the matrix unit it is f32.
+#[test]
+fn inference_in_bf16_is_near_that_in_f32() {
+    let ffdnet = FfdnetSpec { channels: 1, width: 40, depth: 5, layout: FfdnetLayout::Residual { batch_norm: false } };
+    let fastdvdnet = FastdvdnetSpec { channels: 3, widths: [20, 33, 64], batch_norm: true };
+    let nets: [(Box<dyn NetworkDenoiser>, usize); 2] = [
+        (Box::new(Ffdnet::random(ffdnet, 4).unwrap()), 1),
+        (Box::new(Fastdvdnet::random(fastdvdnet, Ends::Circular, 4).unwrap()), 3),
+    ];
+    for (mut net, channels) in nets {
+        let video = pattern((3, channels, 45, 70));
+        let exact = denoise(net.as_mut(), &video);
+        net.set_inference_precision(Precision::Bf16);
+        let found = denoise(net.as_mut(), &video);
+        let norm = |v: &Array4<f32>| v.mapv(|v| v * v).sum().sqrt();
+        let (error, by_network) = (norm(&(&found - &exact)), norm(&(&exact - &video)));
+        println!("{}: relative error {:e}", net.describe(), error / by_network);
+        assert!(error < 2e-2 * by_network, "{}: {error:e} of {by_network:e}", net.describe());
+        let on_amx = Isa::detect().unwrap() == Isa::Amx;
+        assert_eq!(error > 0.0, on_amx, "{}", net.describe());
+        let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        assert!(one.install(|| denoise(net.as_mut(), &video)) == found);
+        net.set_inference_precision(Precision::F32);
+        assert!(denoise(net.as_mut(), &video) == exact);
     }
 }
 

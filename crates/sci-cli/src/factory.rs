@@ -314,14 +314,16 @@ fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>
     };
     Ok(match choice {
         DenoiserChoice::Tv { weight, inner } => Part::Tv { weight: *weight, inner: *inner },
-        DenoiserChoice::Ffdnet { weights } => {
-            let net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
+        DenoiserChoice::Ffdnet { weights, precision } => {
+            let mut net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
             fits(&net, weights)?;
+            net.set_inference_precision(*precision);
             Part::Ffdnet(AdaptiveDenoiser::new(net, adapt)?)
         }
-        DenoiserChoice::Fastdvdnet { weights, ends } => {
-            let net = nets::Fastdvdnet::load(weights, *ends).context("denoiser.weights")?;
+        DenoiserChoice::Fastdvdnet { weights, ends, precision } => {
+            let mut net = nets::Fastdvdnet::load(weights, *ends).context("denoiser.weights")?;
             fits(&net, weights)?;
+            net.set_inference_precision(*precision);
             Part::Fastdvdnet(AdaptiveDenoiser::new(net, adapt)?)
         }
     })

@@ -289,10 +289,11 @@ impl Place {
         let (first, row, step) = match store {
             Store::As(Form::Half) => (panel.block / 2 * block, row, LANES),
             Store::As(_) => (panel.block * block, row, LANES),
-            Store::AddShuffled => {
+            Store::AddShuffled(form) => {
                 let (pair, each) = (panel.block / 2, panels / 4);
                 let (phase, pair) = (pair / each, pair % each);
-                (2 * pair * block + phase / 2 * row + phase % 2 * LANES, 2 * row, 2 * LANES)
+                let first = if form == Form::Half { pair * block } else { 2 * pair * block };
+                (first + phase / 2 * row + phase % 2 * LANES, 2 * row, 2 * LANES)
             }
         };
         Self { ptr: ptr.wrapping_add(first), row, step, second: block, vecs, floor, store }
@@ -338,7 +339,12 @@ impl Pending<'_> {
                     }
                     Store::As(Form::Split) => store_split(a, b, out, out.add(second)),
                     Store::As(Form::Half) => _mm512_storeu_si512(out.cast(), rounded(a, b)),
-                    Store::AddShuffled => {
+                    Store::AddShuffled(Form::Half) => {
+                        let there = widen(_mm512_loadu_si512(out.cast()));
+                        let sum = rounded(_mm512_add_ps(a, there.0), _mm512_add_ps(b, there.1));
+                        _mm512_storeu_si512(out.cast(), sum);
+                    }
+                    Store::AddShuffled(_) => {
                         let [high, low] = [out, out.add(second)].map(|p| widen(_mm512_loadu_si512(p.cast())));
                         let a = _mm512_add_ps(a, _mm512_add_ps(high.0, low.0));
                         let b = _mm512_add_ps(b, _mm512_add_ps(high.1, low.1));
@@ -381,25 +387,29 @@ pub(super) fn rounded(a: __m512, b: __m512) -> __m512i {
     unsafe { std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(b, a)) }
 }
 
-/// Splits `count` pixels of `channels` channels in a row; `src` and `dst` may be the same. Whatever the lanes beyond the
-/// last channel hold, zeros stand for it: the matrix unit multiplies them too.
+/// Splits or halves `count` pixels of `channels` channels in a row; `src` and `dst` may be the same if they are split. Whatever
+/// the lanes beyond the last channel hold, zeros stand for it: the matrix unit multiplies them too.
 ///
 /// # Safety
 /// [`available`]; `src` has the pixels, `dst` room for them, rounded up to an even number of blocks.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-pub(super) unsafe fn split(src: View, channels: usize, count: usize, dst: ViewMut) {
+pub(super) unsafe fn convert(src: View, channels: usize, count: usize, dst: ViewMut, form: Form) {
     let (src_block, dst_block) = (src.block, dst.block);
+    let each = if form == Form::Half { PAIR } else { LANES };
     for c in (0..channels).step_by(PAIR) {
         let used = |from: usize| (1u32 << channels.saturating_sub(from).min(LANES)).wrapping_sub(1) as u16;
         let (first, second) = (used(c), used(c + LANES));
-        let (src, dst) = (src.ptr.wrapping_add(c / LANES * src.block), dst.ptr.wrapping_add(c / LANES * dst.block));
+        let (src, dst) = (src.ptr.wrapping_add(c / LANES * src.block), dst.ptr.wrapping_add(c / each * dst.block));
         for i in 0..count {
             // SAFETY: the caller's contract; of a block that `src` lacks nothing is loaded.
             unsafe {
                 let (p, out) = (src.add(i * LANES), dst.add(i * LANES));
                 let (a, b) =
                     (_mm512_maskz_loadu_ps(first, p), _mm512_maskz_loadu_ps(second, p.wrapping_add(src_block)));
-                store_split(a, b, out, out.add(dst_block));
+                match form {
+                    Form::Half => _mm512_storeu_si512(out.cast(), rounded(a, b)),
+                    _ => store_split(a, b, out, out.wrapping_add(dst_block)),
+                }
             }
         }
     }

@@ -168,11 +168,11 @@ impl PackedConv {
         (self.outputs, self.step.out_size(height), self.step.out_size(width))
     }
 
-    /// Adds the pixel-shuffled result to a split image of twice the size: phase `2i + j` of the outputs to the pixels
+    /// Adds the pixel-shuffled result to an image of twice the size in the same form of the matrix unit: phase `2i + j` of the outputs to the pixels
     /// `(2y + i, 2x + j)`.
     ///
     /// # Errors
-    /// [`KernelError::Form`] when either is for f32, else as [`PackedConv::forward`].
+    /// [`KernelError::Form`] when either is for f32 or they differ, else as [`PackedConv::forward`].
     ///
     /// # Panics
     /// When the output channels are not four times those of the image, in whole pairs of blocks.
@@ -184,16 +184,16 @@ impl PackedConv {
     ) -> Result<(), KernelError> {
         let (_, height, width) = input.shape();
         self.check_image(input)?;
-        if self.input_form() != Form::Split || image.form() != Form::Split {
+        let form = image.form();
+        if self.input_form() != form || form == Form::Single {
             return Err(KernelError::Form);
         }
-        assert_eq!(
-            (4 * image.blocks() * LANES, 2 * height, 2 * width),
-            (self.outputs, image.shape().1, image.shape().2)
-        );
+        let (channels, double_h, double_w) = image.shape();
+        let expected = (4 * channels.next_multiple_of(2 * LANES), 2 * height, 2 * width);
+        assert_eq!(expected, (self.outputs, double_h, double_w));
         let dst = image.view_mut().inner();
         // SAFETY: strips write disjoint rows of the image.
-        unsafe { self.strips((height, width), input, Store::AddShuffled, |y| dst.down(2 * y), scratch) }
+        unsafe { self.strips((height, width), input, Store::AddShuffled(form), |y| dst.down(2 * y), scratch) }
         Ok(())
     }
 
@@ -252,7 +252,7 @@ impl PackedConv {
             match &self.filters {
                 #[cfg(target_arch = "x86_64")]
                 Filters::Amx(f) => amx::forward(f, &self.bias, self.floor, strip, store, slot),
-                _ if store == Store::As(Form::Split) => self.strip_then_split(strip, slot),
+                _ if matches!(store, Store::As(Form::Split | Form::Half)) => self.strip_then_convert(strip, slot),
                 Filters::Winograd(f) => winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot),
                 Filters::Direct(f) => direct::forward(self.isa, f, &self.bias, self.floor, strip, slot),
             }
@@ -261,7 +261,7 @@ impl PackedConv {
 
     /// # Safety
     /// The strip's memory must be valid.
-    unsafe fn strip_then_split(&self, strip: Strip, slot: &mut Slot) {
+    unsafe fn strip_then_convert(&self, strip: Strip, slot: &mut Slot) {
         let Strip { dst, rows, width, .. } = strip;
         let (row, blocks) = (width * LANES, self.outputs.div_ceil(LANES));
         slot.dst.grow(blocks * rows * row);
@@ -270,7 +270,7 @@ impl PackedConv {
         unsafe {
             self.strip(Strip { dst: whole, ..strip }, Store::As(Form::Single), slot);
             for y in 0..rows {
-                split(whole.shared().down(y), self.outputs, width, dst.down(y));
+                convert(whole.shared().down(y), self.outputs, width, dst.down(y), self.form);
             }
         }
     }
@@ -282,8 +282,8 @@ pub(super) enum Store {
     /// It is written.
     As(Form),
     /// Its channels are four phases of an image of twice the size, in whole pairs of blocks each. They are added to the
-    /// split image that is there.
-    AddShuffled,
+    /// image of this form that is there.
+    AddShuffled(Form),
 }
 
 /// Whether the matrix unit is the faster; of up to 16 channels it would waste half and more.
@@ -301,22 +301,22 @@ unsafe fn split_copy(src: View, channels: usize, count: usize, slot: &mut Slot) 
     slot.src.grow(channels.div_ceil(2 * LANES) * 2 * block + SLACK * LANES);
     let dst = ViewMut { ptr: slot.src.as_mut_ptr(), block, row: src.row };
     // SAFETY: the caller's contract.
-    unsafe { split(src, channels, count, dst) };
+    unsafe { convert(src, channels, count, dst, Form::Split) };
     dst.shared()
 }
 
-/// Splits `count` pixels of `channels` channels in a row; `src` and `dst` may be the same.
+/// Splits or halves `count` pixels of `channels` channels in a row.
 ///
 /// # Safety
 /// As that of the function called.
-unsafe fn split(src: View, channels: usize, count: usize, dst: ViewMut) {
+unsafe fn convert(src: View, channels: usize, count: usize, dst: ViewMut, form: Form) {
     #[cfg(target_arch = "x86_64")]
     // SAFETY: the caller's contract.
     unsafe {
-        amx::split(src, channels, count, dst);
+        amx::convert(src, channels, count, dst, form);
     }
     #[cfg(not(target_arch = "x86_64"))]
-    unreachable!("{count} pixels of {channels} channels from {:p} to {:p}: no split images here", src.ptr, dst.ptr);
+    unreachable!("{count} pixels of {channels} channels from {:p} to {:p}: no {form:?} images here", src.ptr, dst.ptr);
 }
 
 /// Output rows worked on at once: whole tiles, enough of them to keep the products wide, few enough for the cache.

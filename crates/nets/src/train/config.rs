@@ -134,8 +134,8 @@ pub struct TrainingConfig {
     /// How weights follow gradients. Default Muon.
     #[serde(default)]
     pub optimizer: Optimizer,
-    /// What the layers multiply, on the way there and back. Default f32; bf16 takes half the time where the processor has a
-    /// matrix unit, and is f32 elsewhere.
+    /// What the layers multiply, on the way there and back and in the solves of [`IteratesConfig`]. Default f32; bf16 takes a third to
+    /// two thirds of the time where the processor has a matrix unit, and is f32 elsewhere.
     #[serde(default)]
     pub precision: Precision,
     /// What is minimised. Default L1.

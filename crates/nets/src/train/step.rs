@@ -285,7 +285,8 @@ impl Trainer {
     /// `unrolled` a lesson for each clip.
     fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
         let now = self.vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor()));
-        let model = self.frozen(now.collect());
+        let mut model = self.frozen(now.collect());
+        model.network_mut().set_inference_precision(self.config.training.precision);
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
         let clip = |seed: u64| {
             let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));

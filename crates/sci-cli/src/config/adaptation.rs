@@ -1,7 +1,6 @@
 //! Owns the rules of `[online]`.
 
 use nets::Parameters;
-use nets::kernels::Precision;
 use online::{AdaptConfig, Guard, Reuse, Schedule, SequenceConfig, Terms};
 
 use super::check::{Checker, Denoiser, MAX_ITERATIONS};
@@ -27,9 +26,6 @@ const PARAMETERS: [(&str, Parameters); 5] = [
     ("norm-affine", Parameters::NormAffine),
 ];
 
-/// What gradients can be computed in.
-const PRECISIONS: [(&str, Precision); 2] = [("f32", Precision::F32), ("bf16", Precision::Bf16)];
-
 impl<'s> Checker<'s> {
     /// The settings of `[online]`, if the table is there and not switched off.
     pub(super) fn online(
@@ -54,7 +50,7 @@ impl<'s> Checker<'s> {
             terms: self.terms(&k, preset.terms)?,
             guard: self.guard(&k, preset.guard)?,
             blind: self.number("online.blind", &k.blind, 0.01..=0.9)?.or(preset.blind),
-            precision: self.choice("online.precision", &k.precision, &PRECISIONS)?.unwrap_or(preset.precision),
+            precision: self.precision("online.precision", &k.precision)?.unwrap_or(preset.precision),
             seed,
         };
         let default = SequenceConfig::default();

@@ -4,6 +4,7 @@ use std::ops::{Range, RangeInclusive};
 
 use admm::{Convention, TwoStageParams, XStep};
 use nets::Ends;
+use nets::kernels::Precision;
 use sci_forward::CfaPattern;
 use toml::Value as Toml;
 
@@ -164,6 +165,8 @@ pub enum Denoiser {
     Ffdnet {
         /// Weight file.
         weights: PathSetting,
+        /// What it multiplies.
+        precision: Precision,
     },
     /// FastDVDnet.
     Fastdvdnet {
@@ -171,6 +174,8 @@ pub enum Denoiser {
         weights: PathSetting,
         /// What stands for the frames before the first and after the last.
         ends: Ends,
+        /// What it multiplies.
+        precision: Precision,
     },
 }
 
@@ -609,6 +614,11 @@ impl<'s> Checker<'s> {
         Ok(stages)
     }
 
+    /// What a network multiplies.
+    pub(super) fn precision(&self, key: &str, value: &Value) -> Result<Option<Precision>, ConfigError> {
+        self.choice(key, value, &[("f32", Precision::F32), ("bf16", Precision::Bf16)])
+    }
+
     fn denoiser(&self, mut section: Section<'s>) -> Result<Denoiser, ConfigError> {
         let (key, span) = (section.key.clone(), section.span.clone());
         let kind = section.take_kind(&["tv", "ffdnet", "fastdvdnet", "wavelet", "wnnm"], None)?;
@@ -622,13 +632,17 @@ impl<'s> Checker<'s> {
             }
             "ffdnet" => {
                 let k: NetKeys = section.read(&["kind"])?;
-                Ok(Denoiser::Ffdnet { weights: self.path(&format!("{key}.weights"), k.weights, &span)? })
+                Ok(Denoiser::Ffdnet {
+                    precision: self.precision(&format!("{key}.precision"), &k.precision)?.unwrap_or_default(),
+                    weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
+                })
             }
             "fastdvdnet" => {
                 let k: VideoNetKeys = section.read(&["kind"])?;
                 let ends = [("circular", Ends::Circular), ("mirrored", Ends::Mirrored)];
                 Ok(Denoiser::Fastdvdnet {
                     ends: self.choice(&format!("{key}.ends"), &k.ends, &ends)?.unwrap_or_default(),
+                    precision: self.precision(&format!("{key}.precision"), &k.precision)?.unwrap_or_default(),
                     weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
                 })
             }

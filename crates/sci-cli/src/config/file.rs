@@ -135,6 +135,7 @@ pub struct TvKeys {
 #[allow(missing_docs)]
 pub struct NetKeys {
     pub weights: Value,
+    pub precision: Value,
 }
 
 /// `[denoiser]`, `kind = "fastdvdnet"`.
@@ -143,6 +144,7 @@ pub struct NetKeys {
 #[allow(missing_docs)]
 pub struct VideoNetKeys {
     pub weights: Value,
+    pub precision: Value,
     pub ends: Value,
 }
 

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use admm::{Convention, HoldOut, XStep};
 use nets::Ends;
+use nets::kernels::Precision;
 use serde_json::{Value, json};
 
 use super::check::{self, Checked, Mask, Momentum, PathSetting};
@@ -72,6 +73,8 @@ pub enum Denoiser {
     Ffdnet {
         /// Weight file, absolute.
         weights: PathBuf,
+        /// What it multiplies.
+        precision: Precision,
     },
     /// FastDVDnet.
     Fastdvdnet {
@@ -79,6 +82,8 @@ pub enum Denoiser {
         weights: PathBuf,
         /// What stands for the frames before the first and after the last.
         ends: Ends,
+        /// What it multiplies.
+        precision: Precision,
     },
 }
 
@@ -177,9 +182,12 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .iter()
         .map(|d| match d {
             check::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
-            check::Denoiser::Ffdnet { weights } => Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)? }),
-            check::Denoiser::Fastdvdnet { weights, ends } => {
-                Ok(Denoiser::Fastdvdnet { weights: locate_weights(weights, source)?, ends: *ends })
+            check::Denoiser::Ffdnet { weights, precision } => {
+                Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)?, precision: *precision })
+            }
+            check::Denoiser::Fastdvdnet { weights, ends, precision } => {
+                let weights = locate_weights(weights, source)?;
+                Ok(Denoiser::Fastdvdnet { weights, ends: *ends, precision: *precision })
             }
         })
         .collect::<Result<_, ConfigError>>()?;
@@ -447,7 +455,11 @@ fn denoiser_json(d: &Denoiser) -> Value {
         Denoiser::Tv { weight, inner } => {
             json!({ "kind": "tv", "weight": weight, "inner": inner })
         }
-        Denoiser::Ffdnet { weights } => json!({ "kind": "ffdnet", "weights": weights }),
-        Denoiser::Fastdvdnet { weights, ends } => json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends }),
+        Denoiser::Ffdnet { weights, precision } => {
+            json!({ "kind": "ffdnet", "weights": weights, "precision": precision })
+        }
+        Denoiser::Fastdvdnet { weights, ends, precision } => {
+            json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends, "precision": precision })
+        }
     }
 }
