@@ -229,9 +229,12 @@ impl<'a> Weights<'a> {
 
     /// Where the weight of output `o`, input `c` is, or nothing when they are of different groups.
     fn index(&self, o: usize, c: usize, tap: usize) -> Option<usize> {
-        let (out_each, in_each) = (self.outputs / self.groups, self.inputs / self.groups);
-        let group = o / out_each;
-        (c / in_each == group).then(|| {
+        // Packing calls this for every weight: no division where there is one group.
+        let alone = self.groups == 1;
+        let out_each = if alone { self.outputs } else { self.outputs / self.groups };
+        let in_each = if alone { self.inputs } else { self.inputs / self.groups };
+        let group = if alone { 0 } else { o / out_each };
+        (alone || c / in_each == group).then(|| {
             if self.adjoint {
                 (c * out_each + o - group * out_each) * 9 + 8 - tap
             } else {

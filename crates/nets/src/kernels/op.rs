@@ -259,8 +259,9 @@ impl Chain {
         let first = self.first_wanted().unwrap_or(self.layers.len());
         for (i, layer) in self.layers.iter().enumerate().skip(first).rev() {
             let inputs: Vec<&Blocked> = kept.iter().map(|kept| &kept[i]).collect();
-            let (mut step, mut back) = match layer.step()? {
-                Step::Same => (Step::Same, Step::Same),
+            // Halved gradients of stride 2 are widened to stride 1.
+            let (step, back) = match layer.step()? {
+                step if step == Step::Same || self.form == Form::Half => (Step::Same, Step::Same),
                 step => (step, Step::Double),
             };
             grads.par_iter_mut().zip(&*kept).for_each(|(grad, kept)| {
@@ -269,9 +270,8 @@ impl Chain {
                 }
                 *grad = to_form(std::mem::take(grad), self.form);
             });
-            if self.form == Form::Half && step != Step::Same {
+            if self.form == Form::Half && layer.opts.stride == 2 {
                 grads.par_iter_mut().zip(&inputs).for_each(|(grad, input)| widen_stride(grad, input));
-                (step, back) = (Step::Same, Step::Same);
             }
             layer.parameter_grads(self.isa, step, &inputs, &grads, &mut all)?;
             if i > first || self.wants_input_grad {
