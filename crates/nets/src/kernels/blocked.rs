@@ -90,11 +90,13 @@ impl Blocked {
     }
 
     /// All pixels with their border, block by block.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn pixels(&self) -> &[Pixel] {
         &self.data
     }
 
     /// As [`Blocked::pixels`], to write.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn pixels_mut(&mut self) -> &mut [Pixel] {
         &mut self.data
     }

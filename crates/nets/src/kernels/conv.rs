@@ -86,6 +86,7 @@ impl PackedConv {
     }
 
     /// Without bias and ReLU; `isa` is available.
+    #[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables, reason = "f32 without a matrix unit"))]
     pub(super) fn pack(isa: Isa, weights: &Weights<'_>, step: Step, precision: Precision) -> Self {
         let (inputs, outputs) = (weights.inputs, weights.outputs);
         let filters = match isa {

@@ -96,7 +96,7 @@ mod blocked;
 mod conv;
 mod direct;
 mod grad;
-#[cfg(target_arch = "x86_64")]
+#[cfg_attr(not(target_arch = "x86_64"), path = "no_half.rs")]
 mod half;
 mod memory;
 mod op;

@@ -6,7 +6,6 @@
 use super::blocked::{Blocked, Form};
 use super::conv::PackedConv;
 use super::grad::{bias_grad, weight_grad};
-#[cfg(target_arch = "x86_64")]
 use super::half;
 use super::scratch::{IMAGES, Scratch};
 use super::simd::Isa;
@@ -299,7 +298,6 @@ impl Drop for Chain {
 
 /// Lets a gradient through where the ReLU let its value through.
 fn mask(grad: &mut Blocked, y: &Blocked) {
-    #[cfg(target_arch = "x86_64")]
     if y.form() == Form::Half {
         // SAFETY: only the matrix unit makes images of this form.
         return unsafe { half::mask(grad, y) };
@@ -320,11 +318,8 @@ fn to_form(image: Blocked, form: Form) -> Blocked {
         return image;
     }
     let mut halved = IMAGES.take(form, image.shape());
-    #[cfg(target_arch = "x86_64")]
     // SAFETY: a chain asks for this form where there is a matrix unit.
-    unsafe {
-        half::round(&image, &mut halved);
-    }
+    unsafe { half::round(&image, &mut halved) };
     IMAGES.give([image]);
     halved
 }
@@ -333,7 +328,6 @@ fn to_form(image: Blocked, form: Form) -> Blocked {
 fn widen_stride(grad: &mut Blocked, input: &Blocked) {
     let (_, height, width) = input.shape();
     let mut wide = IMAGES.take(Form::Half, (grad.shape().0, height, width));
-    #[cfg(target_arch = "x86_64")]
     half::widen_stride(grad, &mut wide);
     IMAGES.give([std::mem::replace(grad, wide)]);
 }
