@@ -60,7 +60,8 @@ fn a_network_is_given_the_sigmas_that_auto_stands_for() {
 #[test]
 fn tv_goes_first_only_once() {
     let bench = Bench::new();
-    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
+    let config = on_the_demo("gray/default.toml").replace("gray_sci", "gray");
+    std::fs::write(bench.path("default.toml"), config).unwrap();
     let iterations_of_tv = |solver: &str| {
         let stages = "stage=[{sigma=20,iterations=2}]";
         run(&bench, &bench.path("default.toml"), "out", &[stages, "skip.enabled=true", solver]);
@@ -70,4 +71,17 @@ fn tv_goes_first_only_once() {
     };
     assert_eq!(iterations_of_tv("solver.momentum=\"measurement\""), 0);
     assert!(iterations_of_tv("solver={kind=\"gap\",start=\"mean\"}") > 0);
+}
+
+#[test]
+fn networks_for_iterates_are_refused() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
+    let refused = bench
+        .finish(bench.command(&["run", "--out", "out", "--set", "skip.enabled=true"]).arg(bench.path("default.toml")));
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
+    for part in ["bundled:fastdvdnet_gray_sci", "bundled:fastdvdnet_gray\"", "skip.enabled = false"] {
+        assert!(refused.stderr.contains(part), "{}", refused.stderr);
+    }
+    assert!(!bench.path("out").exists());
 }

@@ -22,6 +22,12 @@ pub fn bundled_names() -> Vec<&'static str> {
     BUNDLED.iter().map(|(name, _)| *name).collect()
 }
 
+/// Whether a path is that of bundled weights for the iterates of a solver, whose names end in `_sci`. They are no denoisers of
+/// white noise, and know iterates of complete measurements only.
+pub fn bundled_for_iterates(path: &str) -> bool {
+    path.strip_prefix("bundled:").is_some_and(|name| name.ends_with("_sci"))
+}
+
 pub(super) fn bytes(name: &str) -> Result<&'static [u8]> {
     BUNDLED
         .iter()

@@ -10,7 +10,7 @@ use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-pub use bundled::bundled_names;
+pub use bundled::{bundled_for_iterates, bundled_names};
 
 /// The network that a set of tensors belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

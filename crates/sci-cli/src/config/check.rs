@@ -179,6 +179,16 @@ pub enum Denoiser {
     },
 }
 
+impl Denoiser {
+    /// The weight file of a network.
+    pub fn weights(&self) -> Option<&PathSetting> {
+        match self {
+            Self::Tv { .. } => None,
+            Self::Ffdnet { weights, .. } | Self::Fastdvdnet { weights, .. } => Some(weights),
+        }
+    }
+}
+
 /// One `[[stage]]`.
 #[derive(Clone, Debug)]
 pub struct Stage {
@@ -296,6 +306,9 @@ impl<'s> Checker<'s> {
         let (solver, start, demosaicer) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
         let skip = self.skip(skip, seed)?;
         let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named, skip.is_some())?;
+        if skip.is_some() {
+            self.networks_stand_holes(&denoisers)?;
+        }
         let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
         let name = self.name(top.name)?;
