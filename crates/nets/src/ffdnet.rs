@@ -233,7 +233,7 @@ impl Network for Ffdnet {
         let map = noise_map(n, noise, &z)?;
         let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
         let z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
-        let z = chain(&self.layers, &z)?;
+        let z = chain(&self.layers, &[], &z)?;
         let image = crop(&pixel_shuffle(&z, 2)?, h, w)?;
         Ok(if residual { (clips - image)? } else { image })
     }

@@ -2,7 +2,7 @@
 //! and a network's activations are those of one frame.
 
 use crate::Result;
-use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Precision, Scratch};
+use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Precision, Scratch, shuffle};
 use crate::layers::Conv;
 
 /// Packed convolutions and the images between them.
@@ -29,8 +29,7 @@ impl Engine {
                 filters.spread_outputs(opts.groups);
             }
             if shuffled.contains(&i) {
-                let single = form(isa, opts.precision, filters.outputs / 4) == Form::Single;
-                filters.order_by_phase(if single { LANES } else { 2 * LANES });
+                filters.order_by_phase(form(isa, opts.precision, filters.outputs / 4));
             }
             let Filters { inputs, outputs, values, bias } = filters;
             let form = |channels: usize| form(isa, opts.precision, channels);
@@ -84,7 +83,7 @@ impl Engine {
             self.convs[i].0.add_shuffled(&input, image, &mut self.scratch)?;
         } else {
             let quarters = self.conv(i, &input)?;
-            add_shuffled(&quarters, image);
+            shuffle::add_shuffled(&quarters, image);
             self.recycle(quarters);
         }
         self.recycle(input);
@@ -173,19 +172,11 @@ impl Filters {
         self.inputs = groups * wide(each);
     }
 
-    /// Puts the outputs, of a pixel shuffle, in the order `[phase][C]`, each phase filled up with zeros to whole blocks
-    /// of `block` channels. They have no bias.
-    fn order_by_phase(&mut self, block: usize) {
+    /// Puts the outputs, of a pixel shuffle, in the order that the kernels add them in. They have no bias.
+    fn order_by_phase(&mut self, form: Form) {
         let filter = self.values.len() / self.outputs;
-        let channels = self.outputs / 4;
-        let padded = channels.next_multiple_of(block);
-        let mut ordered = vec![0.0; 4 * padded * filter];
-        for (i, values) in self.values.chunks_exact(filter).enumerate() {
-            let (channel, phase) = (i / 4, i % 4);
-            let at = (phase * padded + channel) * filter;
-            ordered[at..at + filter].copy_from_slice(values);
-        }
-        (self.outputs, self.values, self.bias) = (4 * padded, ordered, None);
+        self.values = shuffle::by_phase(&self.values, filter, shuffle::block(form));
+        (self.outputs, self.bias) = (self.values.len() / filter, None);
     }
 }
 
@@ -198,29 +189,6 @@ fn wide(each: usize) -> usize {
 fn filled_up(values: &[f32], each: usize, wide: usize) -> Vec<f32> {
     let zeros = std::iter::repeat_n(0.0, wide - each);
     values.chunks_exact(each).flat_map(|group| group.iter().copied().chain(zeros.clone())).collect()
-}
-
-/// `image += pixel_shuffle(quarters)`: phase `2i + j` of `quarters` goes to the pixels `(2y + i, 2x + j)`.
-fn add_shuffled(quarters: &Blocked, image: &mut Blocked) {
-    let (_, height, width) = quarters.shape();
-    let blocks = image.blocks();
-    for block in 0..blocks {
-        for y in 0..height {
-            for i in 0..2 {
-                let row = image.row_mut(block, 2 * y + i);
-                let left = quarters.row(2 * i * blocks + block, y);
-                let right = quarters.row((2 * i + 1) * blocks + block, y);
-                let pixels = left.as_chunks::<LANES>().0.iter().zip(right.as_chunks::<LANES>().0);
-                for (out, (left, right)) in row.as_chunks_mut::<{ 2 * LANES }>().0.iter_mut().zip(pixels) {
-                    for k in 0..LANES {
-                        out[k] += left[k];
-                        out[LANES + k] += right[k];
-                    }
-                }
-            }
-        }
-        debug_assert_eq!((2 * height, 2 * width), (image.shape().1, image.shape().2));
-    }
 }
 
 /// Sets one channel of an image, row by row.

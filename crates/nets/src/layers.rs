@@ -169,10 +169,14 @@ impl Conv {
     }
 }
 
-/// Layers one after another; differentiable.
-pub(crate) fn chain(convs: &[Conv], x: &Tensor) -> candle_core::Result<Tensor> {
-    let link = |conv: &Conv| conv.folded().map(|(weight, bias)| Link { weight, bias, opts: conv.opts });
-    conv_chain(x, &convs.iter().map(link).collect::<candle_core::Result<Vec<_>>>()?)
+/// Layers one after another; differentiable. `(i, earlier)` of `ways`: the result of layer `i` is shuffled onto that of an earlier one.
+pub(crate) fn chain(convs: &[Conv], ways: &[(usize, usize)], x: &Tensor) -> candle_core::Result<Tensor> {
+    let link = |(i, conv): (usize, &Conv)| {
+        let (weight, bias) = conv.folded()?;
+        let onto = ways.iter().find(|(layer, _)| *layer == i).map(|(_, earlier)| *earlier);
+        Ok(Link { onto, ..Link::new(weight, bias, conv.opts) })
+    };
+    conv_chain(x, &convs.iter().enumerate().map(link).collect::<candle_core::Result<Vec<_>>>()?)
 }
 
 /// How a tensor starts when it is not loaded.

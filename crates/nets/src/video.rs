@@ -10,7 +10,6 @@ use crate::kernels::{Blocked, Conv3x3};
 use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Padding, Window, crop, noise_map, reflect};
 use candle_core::Tensor;
-use candle_nn::ops::pixel_shuffle;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, s};
 use rayon::prelude::*;
 
@@ -97,6 +96,9 @@ const LAYERS: [(&str, usize, bool); 16] = [
     ("outc.convblock.3", 1, false),
 ];
 
+/// Layers whose result is shuffled onto that of an earlier one.
+const ONTO: [(usize, usize); 2] = [(10, 4), (13, 1)];
+
 /// The U-shaped block: three frames in, one out.
 #[derive(Debug, Clone)]
 struct Block {
@@ -147,12 +149,7 @@ impl Block {
 
     /// `[N, 3(C + 1), H, W]` -> `[N, C, H, W]`, `H` and `W` multiples of 4.
     fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let run = |x: &Tensor, layers: std::ops::Range<usize>| chain(&self.convs[layers], x);
-        let full = run(x, 0..2)?;
-        let half = run(&full, 2..5)?;
-        let half = (&half + pixel_shuffle(&run(&half, 5..11)?, 2)?)?;
-        let full = (full + pixel_shuffle(&run(&half, 11..14)?, 2)?)?;
-        run(&full, 14..16)
+        chain(&self.convs, &ONTO, x)
     }
 }
 
@@ -267,7 +264,7 @@ impl VideoNet {
 }
 
 /// Layers whose output is shuffled, in both blocks.
-const SHUFFLED: [usize; 4] = [10, 13, LAYERS.len() + 10, LAYERS.len() + 13];
+const SHUFFLED: [usize; 4] = [ONTO[0].0, ONTO[1].0, LAYERS.len() + ONTO[0].0, LAYERS.len() + ONTO[1].0];
 
 /// Runs blocks on single triplets.
 struct BlockRun<'a> {

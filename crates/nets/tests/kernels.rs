@@ -246,10 +246,9 @@ fn gradients_of_a_chain_in_bf16_are_near_those_in_f32() -> Result<()> {
     };
     let params = [shape(40, 3)?, shape(70, 40)?, shape(33, 70)?, shape(8, 33)?];
     let gradients = |precision: Precision| -> Result<Vec<f32>> {
-        let link = |((w, b), (stride, relu)): (&(Var, Var), (usize, bool))| Link {
-            weight: w.as_tensor().clone(),
-            bias: Some(b.as_tensor().clone()),
-            opts: Conv3x3 { stride, relu, precision, ..Conv3x3::default() },
+        let link = |((w, b), (stride, relu)): (&(Var, Var), (usize, bool))| {
+            let opts = Conv3x3 { stride, relu, precision, ..Conv3x3::default() };
+            Link::new(w.as_tensor().clone(), Some(b.as_tensor().clone()), opts)
         };
         let kinds = [(1, true), (2, true), (1, true), (1, false)];
         let y = conv_chain(&x, &params.iter().zip(kinds).map(link).collect::<Vec<_>>())?;
@@ -267,6 +266,80 @@ fn gradients_of_a_chain_in_bf16_are_near_those_in_f32() -> Result<()> {
     assert!(error < 2e-2, "{error}");
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     assert!(one.install(|| gradients(Precision::Bf16))? == found);
+    Ok(())
+}
+
+/// A small U of layers, two of which are shuffled onto earlier ones: its result, and its gradient by input and parameters.
+fn u_shaped(dtype: DType, precision: Precision) -> Result<Vec<f64>> {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let mut var = |shape: &[usize], limit: f32| {
+        let values = uniform(&mut rng, shape.iter().product(), limit);
+        Var::from_tensor(&Tensor::from_vec(values, shape, &Device::Cpu)?.to_dtype(dtype)?)
+    };
+    let x = var(&[3, 3, 20, 44], 1.0)?;
+    let (mut links, mut vars) = (Vec::new(), vec![x.clone()]);
+    for (outputs, inputs, stride, relu, onto) in [
+        (36, 3, 1, true, None),
+        (21, 36, 2, true, None),
+        (40, 21, 2, true, None),
+        (84, 40, 1, false, Some(1)),
+        (19, 21, 1, true, None),
+        (144, 19, 1, false, Some(0)),
+        (5, 36, 1, false, None),
+    ] {
+        let weight = var(&[outputs, inputs, 3, 3], (6.0 / (9 * inputs) as f32).sqrt())?;
+        let bias = if onto.is_none() { Some(var(&[outputs], 0.1)?) } else { None };
+        let opts = Conv3x3 { stride, relu, precision, ..Conv3x3::default() };
+        let tensor = |var: &Var| var.as_tensor().clone();
+        links.push(Link { onto, ..Link::new(tensor(&weight), bias.as_ref().map(tensor), opts) });
+        vars.extend([weight].into_iter().chain(bias));
+    }
+    let y = conv_chain(&x, &links)?;
+    let grads = y.sqr()?.sum_all()?.backward()?;
+    let flat = |t: &Tensor| t.flatten_all()?.to_dtype(DType::F64)?.to_vec1::<f64>();
+    let mut all = flat(&y)?;
+    for var in &vars {
+        all.extend(flat(grads.get(var).expect("a gradient for every variable"))?);
+    }
+    Ok(all)
+}
+
+#[test]
+fn results_shuffled_onto_earlier_ones_are_those_of_candle() -> Result<()> {
+    let exact = u_shaped(DType::F64, Precision::F32)?;
+    for (precision, bound) in [(Precision::F32, 1e-5), (Precision::Bf16, 2e-2)] {
+        let found = u_shaped(DType::F32, precision)?;
+        let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
+        let error = square(&mut exact.iter().zip(&found).map(|(a, b)| a - b)) / square(&mut exact.iter().copied());
+        println!("relative error of results and gradients, {precision:?}: {error:.2e}");
+        assert!(error < bound, "{precision:?}: {error}");
+    }
+    Ok(())
+}
+
+#[test]
+fn layers_that_cannot_be_shuffled_onto_others_are_refused() -> Result<()> {
+    let tensor = |shape: &[usize]| Tensor::ones(shape, DType::F32, &Device::Cpu);
+    let x = tensor(&[1, 2, 6, 6])?;
+    let link = |outputs: usize, stride: usize, onto: Option<usize>| {
+        let link = Link::new(tensor(&[outputs, 2, 3, 3])?, None, Conv3x3 { stride, ..Conv3x3::default() });
+        Result::Ok(Link { onto, ..link })
+    };
+    for (links, expected) in [
+        (
+            vec![link(2, 1, None)?, link(8, 1, Some(1))?, link(2, 1, None)?],
+            "layer 1 of 8 channels cannot go onto layer 1",
+        ),
+        (
+            vec![link(2, 1, None)?, link(4, 1, Some(0))?, link(2, 1, None)?],
+            "layer 1 of 4 channels cannot go onto layer 0",
+        ),
+        (vec![link(2, 2, None)?, link(8, 1, Some(0))?], "layer 1 of 8 channels cannot go onto layer 0"),
+        (vec![link(2, 1, None)?, link(8, 1, Some(0))?, link(2, 1, None)?], "twice 6×6, of layer 1, is not the size"),
+    ] {
+        let error = conv_chain(&x, &links).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
     Ok(())
 }
 

@@ -132,13 +132,16 @@ type Results = [Pixel; 2 * PAIR];
 pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Strip, store: Store, slot: &mut Slot) {
     let Strip { src, dst, rows, width } = strip;
     let parts = if conv.form == Form::Half { 1 } else { 2 };
+    // Two tiles of pixels are side by side, or, where a row fills but one, on two rows.
+    let (down, right) = if width <= ROWS { (1, 0) } else { (0, ROWS) };
+    let second = conv.stride * (down * src.row + right * LANES);
     slot.runs.clear();
     for (tap, pair) in (0..9).flat_map(|tap| (0..conv.pairs).map(move |pair| (tap, pair))) {
         let offset = parts * pair * src.block + tap / 3 * src.row + tap % 3 * LANES;
         slot.runs.push(Run { offset, len: PAIR });
     }
     let mut buffers: [Results; 2] = [[ZERO; 2 * PAIR]; 2];
-    let [first, second] = buffers.each_mut().map(|b| &raw mut *b);
+    let [even, odd] = buffers.each_mut().map(|b| &raw mut *b);
     let mut filters = conv.filters.as_ptr();
     // SAFETY: the caller's contract; `filters` has what each panel takes, `bias` a pixel for each block.
     unsafe {
@@ -152,14 +155,19 @@ pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Stri
                 (2, _) => multiply::<2, false>,
                 _ => multiply::<1, false>,
             };
-            let mut previous = Pending { place: &place, results: first, y: 0, x: 0, count: 0, done: 0 };
-            let mut next = second;
-            for y in 0..rows {
+            let mut previous = Pending { place: &place, results: even, tiles: [(0, 0); 2], done: 0 };
+            let mut next = odd;
+            for y in (0..rows).step_by(1 + down) {
                 for x in (0..width).step_by(PAIR) {
                     let a = src.ptr.add(conv.stride * (y * src.row + x * LANES));
-                    multiply(a, conv.stride, src.block, &slot.runs, filters, bias, next, &mut previous);
+                    multiply((a, second), conv.stride, src.block, &slot.runs, filters, bias, next, &mut previous);
                     let results = std::mem::replace(&mut next, previous.results);
-                    previous = Pending { place: &place, results, y, x, count: PAIR.min(width - x), done: 0 };
+                    let tile = |y: usize, x: usize| {
+                        let count = if y < rows { ROWS.min(width.saturating_sub(x)) } else { 0 };
+                        (y * place.row + x * place.step, count)
+                    };
+                    previous =
+                        Pending { place: &place, results, tiles: [tile(y, x), tile(y + down, x + right)], done: 0 };
                 }
             }
             previous.advance(PAIR);
@@ -169,12 +177,13 @@ pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Stri
     }
 }
 
-/// `results[pixel][v] = bias + Σ` over the runs of 32 pixels from `a` on, `low` floats from `hi` to `lo` unless `HALF`.
+/// `results[pixel][v] = bias + Σ` over the runs of 16 pixels from `a` on and 16 from `second` floats after it on, `low` floats from `hi`
+/// to `lo` unless `HALF`.
 /// Meanwhile the vector unit puts the previous pixels in their place.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 #[allow(clippy::too_many_arguments)]
 unsafe fn multiply<const V: usize, const HALF: bool>(
-    a: *const f32,
+    (a, second): (*const f32, usize),
     stride: usize,
     low: usize,
     runs: &[Run],
@@ -196,7 +205,7 @@ unsafe fn multiply<const V: usize, const HALF: bool>(
         }
         for run in runs {
             let p = a.add(run.offset);
-            let q = p.add(ROWS * stride * LANES);
+            let q = p.add(second);
             if HALF {
                 asm!(
                     "tileloadd tmm4, [{p} + {s}*1]",
@@ -300,13 +309,12 @@ impl Place {
     }
 }
 
-/// Results of pixels `x..x + count` of row `y`, of which `done` have been put in their place.
+/// Results of two tiles of pixels, of which `done` have been put in their place.
 struct Pending<'a> {
     place: &'a Place,
     results: *mut Results,
-    y: usize,
-    x: usize,
-    count: usize,
+    /// Where the first pixel of each goes, in floats, and how many of its 16 there are.
+    tiles: [(usize, usize); 2],
     done: usize,
 }
 
@@ -315,13 +323,18 @@ impl Pending<'_> {
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     unsafe fn advance(&mut self, pixels: usize) {
-        let &Place { ptr, row, step, second, vecs, floor, store } = self.place;
+        let &Place { ptr, step, second, vecs, floor, store, .. } = self.place;
         let floor = _mm512_set1_ps(floor);
-        let end = self.count.min(self.done + pixels);
+        let end = PAIR.min(self.done + pixels);
         while self.done < end {
+            let ((first, count), i) = (self.tiles[self.done / ROWS], self.done % ROWS);
+            if i >= count {
+                self.done += 1;
+                continue;
+            }
             // SAFETY: the caller gives the memory of the pixels; two vectors of results each.
             unsafe {
-                let out = ptr.add(self.y * row + (self.x + self.done) * step);
+                let out = ptr.add(first + i * step);
                 let values = self.results.cast::<f32>().add(2 * self.done * LANES);
                 // MAXPS gives its second operand when one is NaN
                 let a = _mm512_max_ps(floor, _mm512_load_ps(values));

@@ -90,13 +90,11 @@ impl Blocked {
     }
 
     /// All pixels with their border, block by block.
-    #[cfg(target_arch = "x86_64")]
     pub(super) fn pixels(&self) -> &[Pixel] {
         &self.data
     }
 
     /// As [`Blocked::pixels`], to write.
-    #[cfg(target_arch = "x86_64")]
     pub(super) fn pixels_mut(&mut self) -> &mut [Pixel] {
         &mut self.data
     }
@@ -111,7 +109,6 @@ impl Blocked {
     }
 
     fn first_pixel(&self, block: usize, y: usize) -> usize {
-        assert_eq!(self.form, Form::Single, "the numbers of an image for the matrix unit");
         assert!(
             block < self.blocks() && y < self.height,
             "block {block}, row {y} of {} blocks, {} rows",
@@ -126,8 +123,24 @@ impl Blocked {
     /// # Panics
     /// When there is no such block or row.
     pub fn row(&self, block: usize, y: usize) -> &[f32] {
+        self.check_single();
+        floats(self.pixel_row(block, y))
+    }
+
+    fn check_single(&self) {
+        assert_eq!(self.form, Form::Single, "the numbers of an image for the matrix unit");
+    }
+
+    /// As [`Blocked::row`], in any form.
+    pub(super) fn pixel_row(&self, block: usize, y: usize) -> &[Pixel] {
         let first = self.first_pixel(block, y);
-        floats(&self.data[first..first + self.width])
+        &self.data[first..first + self.width]
+    }
+
+    /// As [`Blocked::pixel_row`], to write.
+    pub(super) fn pixel_row_mut(&mut self, block: usize, y: usize) -> &mut [Pixel] {
+        let first = self.first_pixel(block, y);
+        &mut self.data[first..first + self.width]
     }
 
     /// Row `y` of a channel block, to write: `[W][16]`.
@@ -135,8 +148,8 @@ impl Blocked {
     /// # Panics
     /// When there is no such block or row.
     pub fn row_mut(&mut self, block: usize, y: usize) -> &mut [f32] {
-        let first = self.first_pixel(block, y);
-        floats_mut(&mut self.data[first..first + self.width])
+        self.check_single();
+        floats_mut(self.pixel_row_mut(block, y))
     }
 
     /// Takes on the shape `(channels, height, width)` and the content of `planes [C,H,W]`.
@@ -185,6 +198,7 @@ impl Blocked {
 
     /// The rows of a channel block in parallel.
     pub(crate) fn par_rows_mut(&mut self, block: usize) -> impl IndexedParallelIterator<Item = &mut [[f32; LANES]]> {
+        self.check_single();
         let (width, row) = (self.width, padded(self.width));
         let first = self.first_pixel(block, 0) - 1;
         let rows = &mut floats_mut(&mut self.data)[first * LANES..][..self.height * row * LANES];

@@ -7,7 +7,7 @@
 //!
 //! A product of the matrix unit sums over 32 pixels of a row. On its left it takes 16 output channels of ∂y, each with its 32 pixels in a
 //! row: 32 × 32 numbers, transposed. On its right 16 input channels of x in pairs of pixels, once for each of the three columns of
-//! taps, as a pair begins at another pixel for each.
+//! taps, as a pair begins at another pixel for each. Where rows are of 16 pixels or fewer, the 32 are those of two rows.
 
 use super::amx::{TILES, rounded, widen};
 use super::blocked::{Blocked, Form, Pixel, ZERO};
@@ -67,6 +67,22 @@ pub(super) unsafe fn mask(grad: &mut Blocked, y: &Blocked) {
             let p = g.0.as_mut_ptr().cast();
             let open = _mm512_cmpgt_epi16_mask(_mm512_load_si512(y.0.as_ptr().cast()), _mm512_setzero_si512());
             _mm512_store_si512(p, _mm512_maskz_mov_epi16(open, _mm512_load_si512(p)));
+        }
+    }
+}
+
+/// `sum += other`, of one shape.
+///
+/// # Safety
+/// [`amx::available`](super::amx::available).
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+pub(super) unsafe fn add(sum: &mut Blocked, other: &Blocked) {
+    for (sum, other) in sum.pixels_mut().iter_mut().zip(other.pixels()) {
+        // SAFETY: each is a cache line.
+        unsafe {
+            let p = sum.0.as_mut_ptr().cast();
+            let [a, b] = [widen(_mm512_load_si512(p)), widen(_mm512_load_si512(other.0.as_ptr().cast()))];
+            _mm512_store_si512(p, rounded(_mm512_add_ps(a.0, b.0), _mm512_add_ps(a.1, b.1)));
         }
     }
 }
@@ -133,8 +149,9 @@ pub(super) unsafe fn weight_grad(
     slot: &mut Slot,
 ) {
     let GradStrip { input, grad, rows, width } = strip;
+    let two_rows = width <= LANES;
     let across = width.div_ceil(HALVES);
-    let products = rows * across;
+    let products = if two_rows { rows.div_ceil(2) } else { rows * across };
     slot.a.grow(plan.blocks_out * products * OPERAND * LANES);
     let of_grad: *mut Pixel = slot.a.as_mut_ptr().cast();
     // Of one column of taps: the products of the first row of taps, of the second two rows on.
@@ -145,9 +162,15 @@ pub(super) unsafe fn weight_grad(
     unsafe {
         for (block, bias) in bias.as_chunks_mut::<2>().0.iter_mut().enumerate() {
             for product in 0..products {
-                let (y, x) = (product / across, product % across * HALVES);
+                let (y, x) = if two_rows { (2 * product, 0) } else { (product / across, product % across * HALVES) };
                 let from = grad.ptr.add(block * grad.block + y * grad.row + x * LANES);
-                transpose(from, width - x, bias, of_grad.add((block * products + product) * OPERAND));
+                let (second, left) = if two_rows {
+                    (grad.row, if y + 1 < rows { width } else { 0 })
+                } else {
+                    (LANES * LANES, (width - x).saturating_sub(LANES))
+                };
+                let counts = [LANES.min(width - x), LANES.min(left)];
+                transpose((from, second), counts, bias, of_grad.add((block * products + product) * OPERAND));
             }
         }
         asm!("ldtilecfg [{}]", in(reg) &raw const TILES, options(nostack, readonly));
@@ -155,8 +178,9 @@ pub(super) unsafe fn weight_grad(
             for at in 0..(rows + 2) * across {
                 let (y, x) = (at / across, at % across * HALVES);
                 let from = input.ptr.add(block_in * input.block + y * input.row + x * LANES);
+                let second = if two_rows { input.row } else { LANES * LANES };
                 for dx in 0..3 {
-                    pairs(from.add(dx * LANES), of_input.add(dx * column + at * OPERAND));
+                    pairs((from.add(dx * LANES), second), of_input.add(dx * column + at * OPERAND));
                 }
             }
             for block_out in 0..plan.blocks_out {
@@ -164,7 +188,7 @@ pub(super) unsafe fn weight_grad(
                 for tap in 0..9 {
                     let a = of_grad.add(block_out * products * OPERAND);
                     let b = of_input.add(tap % 3 * column + tap / 3 * across * OPERAND);
-                    multiply(a, b, products, sums.add(tap * SUMS));
+                    multiply(a, (b, if two_rows { 2 * OPERAND } else { OPERAND }), products, sums.add(tap * SUMS));
                 }
             }
         }
@@ -172,9 +196,9 @@ pub(super) unsafe fn weight_grad(
     }
 }
 
-/// `sums[o][i] += Σ a[o][p] b[p][i]` for 32 × 32 channels and 32 `count` pixels.
+/// `sums[o][i] += Σ a[o][p] b[p][i]` for 32 × 32 channels and 32 `count` pixels; `each` cache lines from one b to the next.
 #[inline]
-unsafe fn multiply(mut a: *const Pixel, mut b: *const Pixel, count: usize, sums: *mut Pixel) {
+unsafe fn multiply(mut a: *const Pixel, (mut b, each): (*const Pixel, usize), count: usize, sums: *mut Pixel) {
     // SAFETY: the caller gives the memory; the tiles are configured.
     unsafe {
         asm!("tileloadd tmm0, [{c} + {t}*1]", "tileloadd tmm1, [{c} + {t}*1 + 1024]",
@@ -192,7 +216,7 @@ unsafe fn multiply(mut a: *const Pixel, mut b: *const Pixel, count: usize, sums:
                 "tdpbf16ps tmm3, tmm5, tmm7",
                 a = in(reg) a, b = in(reg) b, t = in(reg) 64usize, options(nostack, readonly),
             );
-            (a, b) = (a.add(OPERAND), b.add(OPERAND));
+            (a, b) = (a.add(OPERAND), b.add(each));
         }
         asm!("tilestored [{c} + {t}*1], tmm0", "tilestored [{c} + {t}*1 + 1024], tmm1",
             "tilestored [{c} + {t}*1 + 2048], tmm2", "tilestored [{c} + {t}*1 + 3072], tmm3",
@@ -200,10 +224,11 @@ unsafe fn multiply(mut a: *const Pixel, mut b: *const Pixel, count: usize, sums:
     }
 }
 
-/// 32 pixels of 32 channels as 16 pairs of pixels of 16 channels, and of the 16 after them.
+/// 16 pixels of 32 channels, and 16 that begin `second` floats after them, as 16 pairs of pixels of 16 channels, and of the 16 channels
+/// after those.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw")]
-unsafe fn pairs(from: *const f32, to: *mut Pixel) {
+unsafe fn pairs((from, second): (*const f32, usize), to: *mut Pixel) {
     const fn picks(first: u16) -> [u16; HALVES] {
         let (mut all, mut k) = ([0; HALVES], 0);
         while k < LANES {
@@ -217,18 +242,19 @@ unsafe fn pairs(from: *const f32, to: *mut Pixel) {
     unsafe {
         let [low, high] = [0, 1].map(|i| _mm512_loadu_si512(PICKS[i].as_ptr().cast()));
         for k in 0..LANES {
-            let p = _mm512_loadu_si512(from.add(2 * k * LANES).cast());
-            let q = _mm512_loadu_si512(from.add((2 * k + 1) * LANES).cast());
+            let pair = from.add(k / (LANES / 2) * second + 2 * k % LANES * LANES);
+            let [p, q] = [pair, pair.add(LANES)].map(|p| _mm512_loadu_si512(p.cast()));
             _mm512_store_si512(to.add(k).cast(), _mm512_permutex2var_epi16(p, low, q));
             _mm512_store_si512(to.add(LANES + k).cast(), _mm512_permutex2var_epi16(p, high, q));
         }
     }
 }
 
-/// 32 pixels of 32 channels as 32 channels of 32 pixels, zeros after the first `count` pixels; adds the pixels to `sums`.
+/// 16 pixels of 32 channels, and 16 that begin `second` floats after them, as 32 channels of 32 pixels, zeros for those beyond the
+/// counts; adds the pixels to `sums`.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw")]
-unsafe fn transpose(from: *const f32, count: usize, sums: &mut [Pixel; 2], to: *mut Pixel) {
+unsafe fn transpose((from, second): (*const f32, usize), counts: [usize; 2], sums: &mut [Pixel; 2], to: *mut Pixel) {
     /// What a row takes of itself and of the row `1 << bit` after it, and what that one takes.
     const fn picks(bit: usize, second: bool) -> [u16; HALVES] {
         let (mut all, mut j) = ([0; HALVES], 0);
@@ -250,12 +276,15 @@ unsafe fn transpose(from: *const f32, count: usize, sums: &mut [Pixel; 2], to: *
     };
     // SAFETY: the caller gives the pixels and 32 cache lines.
     unsafe {
-        let [mut first, mut second] = [0, 1].map(|i| _mm512_load_ps(sums[i].0.as_ptr()));
+        let [mut low, mut high] = [0, 1].map(|i| _mm512_load_ps(sums[i].0.as_ptr()));
         let mut rows = [_mm512_setzero_si512(); HALVES];
-        for (i, row) in rows.iter_mut().enumerate().take(count) {
-            *row = _mm512_loadu_si512(from.add(i * LANES).cast());
-            let (a, b) = widen(*row);
-            (first, second) = (_mm512_add_ps(first, a), _mm512_add_ps(second, b));
+        for (tile, count) in counts.into_iter().enumerate() {
+            for i in 0..count {
+                let row = _mm512_loadu_si512(from.add(tile * second + i * LANES).cast());
+                rows[tile * LANES + i] = row;
+                let (a, b) = widen(row);
+                (low, high) = (_mm512_add_ps(low, a), _mm512_add_ps(high, b));
+            }
         }
         for (bit, picks) in PICKS.iter().enumerate() {
             let [own, other] = [0, 1].map(|i| _mm512_loadu_si512(picks[i].as_ptr().cast()));
@@ -266,7 +295,7 @@ unsafe fn transpose(from: *const f32, count: usize, sums: &mut [Pixel; 2], to: *
             }
         }
         rows.iter().enumerate().for_each(|(i, row)| _mm512_store_si512(to.add(i).cast(), *row));
-        _mm512_store_ps(sums[0].0.as_mut_ptr(), first);
-        _mm512_store_ps(sums[1].0.as_mut_ptr(), second);
+        _mm512_store_ps(sums[0].0.as_mut_ptr(), low);
+        _mm512_store_ps(sums[1].0.as_mut_ptr(), high);
     }
 }

@@ -12,6 +12,10 @@ pub(super) unsafe fn mask(_: &mut Blocked, _: &Blocked) {
     unreachable!("{REASON}")
 }
 
+pub(super) unsafe fn add(_: &mut Blocked, _: &Blocked) {
+    unreachable!("{REASON}")
+}
+
 pub(super) fn widen_stride(_: &Blocked, _: &mut Blocked) {
     unreachable!("{REASON}")
 }

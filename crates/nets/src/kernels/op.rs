@@ -9,9 +9,10 @@ use super::grad::{bias_grad, weight_grad};
 use super::half;
 use super::scratch::{IMAGES, Scratch};
 use super::simd::Isa;
-use super::{KernelError, Step, Weights};
+use super::{KernelError, Step, Weights, shuffle};
 use candle_core::{CpuStorage, CustomOp2, DType, Device, Error, Layout, Result, Shape, Storage, Tensor};
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
 
 /// Of what knows nothing of candle.
@@ -57,9 +58,18 @@ pub struct Link {
     pub bias: Option<Tensor>,
     /// How it is done.
     pub opts: Conv3x3,
+    /// A way around other layers: the pixel-shuffled result, a quarter of its channels on twice the height and width, is added to
+    /// the result of this earlier layer (counted from 0), and the sum goes on. Such a layer is of stride 1 and has neither groups, bias
+    /// nor ReLU; it cannot be the last.
+    pub onto: Option<usize>,
 }
 
 impl Link {
+    /// A layer whose result goes on as it is.
+    pub fn new(weight: Tensor, bias: Option<Tensor>, opts: Conv3x3) -> Self {
+        Self { weight, bias, opts, onto: None }
+    }
+
     fn tensors(&self) -> impl Iterator<Item = &Tensor> {
         std::iter::once(&self.weight).chain(&self.bias)
     }
@@ -95,7 +105,7 @@ impl Link {
 /// When the shapes do not fit together, the stride is neither 1 nor 2, a shape has a zero, or `SCI_KERNEL` asks for an
 /// instruction set that this machine lacks.
 pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
-    conv_chain(x, &[Link { weight: w.clone(), bias: bias.cloned(), opts }])
+    conv_chain(x, &[Link::new(w.clone(), bias.cloned(), opts)])
 }
 
 /// As [`conv3x3`], for f32 on the CPU and a given instruction set.
@@ -103,7 +113,7 @@ pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> 
 /// # Errors
 /// As [`conv3x3`], when a tensor is not f32 on the CPU, and when this machine lacks the instruction set.
 pub fn conv3x3_on(isa: Isa, x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
-    Chain::run(isa, x, &[Link { weight: w.clone(), bias: bias.cloned(), opts }])
+    Chain::run(isa, x, &[Link::new(w.clone(), bias.cloned(), opts)])
 }
 
 /// Convolutions one after another, each as [`conv3x3`]; differentiable in the input and in all weights and biases. Until the
@@ -113,7 +123,7 @@ pub fn conv3x3_on(isa: Isa, x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts:
 /// use candle_core::{DType, Device, Tensor};
 /// use nets::kernels::{Conv3x3, Link, conv_chain};
 /// let weight = Tensor::ones((1, 1, 3, 3), DType::F32, &Device::Cpu)?;
-/// let link = Link { weight, bias: None, opts: Conv3x3 { stride: 2, ..Conv3x3::default() } };
+/// let link = Link::new(weight, None, Conv3x3 { stride: 2, ..Conv3x3::default() });
 /// let x = Tensor::ones((1, 1, 4, 4), DType::F32, &Device::Cpu)?;
 /// assert_eq!(conv_chain(&x, &[link.clone(), link])?.flatten_all()?.to_vec1::<f32>()?, [25.]);
 /// # Ok::<(), candle_core::Error>(())
@@ -128,7 +138,18 @@ pub fn conv_chain(x: &Tensor, links: &[Link]) -> Result<Tensor> {
         let isa = if bf16 { Isa::detect() } else { Isa::detect_for_gradients() };
         return Chain::run(isa.map_err(Error::wrap)?, x, links);
     }
-    links.iter().try_fold(x.clone(), |x, link| link.by_candle(&x))
+    let mut results: Vec<Tensor> = Vec::new();
+    for link in links {
+        let y = link.by_candle(results.last().unwrap_or(x))?;
+        results.push(match link.onto {
+            None => y,
+            Some(layer) => match results.get(layer) {
+                Some(earlier) => (earlier + candle_nn::ops::pixel_shuffle(&y, 2)?)?,
+                None => candle_core::bail!("conv_chain: layer {} goes onto layer {layer}", results.len()),
+            },
+        });
+    }
+    Ok(results.pop().unwrap_or_else(|| x.clone()))
 }
 
 /// A layer as the operation sees it.
@@ -142,46 +163,71 @@ struct Layer {
     biases: usize,
     /// Whether a gradient by weights, or by biases, is asked for.
     wants: (bool, bool),
+    /// The earlier layer onto whose result its own is shuffled.
+    onto: Option<usize>,
 }
 
 impl Layer {
+    /// Numbers of an output's filter.
+    fn filter(&self) -> usize {
+        self.inputs / self.opts.groups * 9
+    }
+
     fn weights<'p>(&self, params: &'p [f32]) -> &'p [f32] {
-        &params[self.at..][..self.outputs * (self.inputs / self.opts.groups) * 9]
+        &params[self.at..][..self.outputs * self.filter()]
+    }
+
+    /// The weights as the kernels are given them, for images of this form, with the number of outputs.
+    fn ordered<'p>(&self, params: &'p [f32], form: Form) -> (Cow<'p, [f32]>, usize) {
+        let weights = self.weights(params);
+        match self.onto {
+            None => (weights.into(), self.outputs),
+            Some(_) => {
+                let ordered = shuffle::by_phase(weights, self.filter(), shuffle::block(form));
+                let outputs = ordered.len() / self.filter();
+                (ordered.into(), outputs)
+            }
+        }
     }
 
     fn step(&self) -> Checked<Step> {
         Step::of_stride(self.opts.stride)
     }
 
-    fn packed(&self, isa: Isa, params: &[f32]) -> Checked<PackedConv> {
-        let weights = self.weights(params);
-        let bias = &params[self.at + weights.len()..][..self.biases];
+    fn packed(&self, isa: Isa, params: &[f32], form: Form) -> Checked<PackedConv> {
+        let (weights, outputs) = self.ordered(params, form);
+        let bias = &params[self.at + self.weights(params).len()..][..self.biases];
         let bias = (self.biases > 0).then_some(bias);
-        PackedConv::new_on(isa, weights, bias, self.inputs, self.outputs, self.opts)
+        PackedConv::new_on(isa, &weights, bias, self.inputs, outputs, self.opts)
     }
 
     /// The gradient by the input, as a convolution of the gradient by the result, with this step.
-    fn adjoint(&self, isa: Isa, params: &[f32], step: Step) -> Checked<PackedConv> {
-        let weights = Weights::new(self.weights(params), self.inputs, self.outputs, self.opts.groups)?;
+    fn adjoint(&self, isa: Isa, params: &[f32], step: Step, form: Form) -> Checked<PackedConv> {
+        let (weights, outputs) = self.ordered(params, form);
+        let weights = Weights::new(&weights, self.inputs, outputs, self.opts.groups)?;
         Ok(PackedConv::pack(isa, &weights.adjoint(), step, self.opts.precision))
     }
 
     /// Writes the gradients that are wanted to their places among those of all parameters.
     fn parameter_grads(&self, isa: Isa, step: Step, x: &[&Blocked], grads: &[Blocked], all: &mut [f32]) -> Checked<()> {
         let halves = grads.first().is_some_and(|grad| grad.form() == Form::Half);
+        let outputs = grads.first().map_or(self.outputs, |grad| grad.shape().0);
         let own = &mut all[self.at..];
+        let (own, own_bias) = own.split_at_mut(self.outputs * self.filter());
         let bias = match self.wants {
             (weights, bias) if weights || halves && bias => {
-                let shape = (self.inputs, self.outputs, self.opts.groups);
+                let shape = (self.inputs, outputs, self.opts.groups);
                 let (dw, db) = Scratch::lend(|scratch| weight_grad(isa, x, grads, shape, step, scratch))?;
-                own[..dw.len()].copy_from_slice(&dw);
+                match self.onto {
+                    None => own.copy_from_slice(&dw),
+                    Some(_) => shuffle::by_channel(&dw, self.filter(), own),
+                }
                 db
             }
             (_, true) => bias_grad(grads, self.outputs),
             (_, false) => return Ok(()),
         };
-        let weights = self.outputs * (self.inputs / self.opts.groups) * 9;
-        own[weights..][..self.biases].copy_from_slice(&bias[..self.biases]);
+        own_bias[..self.biases].copy_from_slice(&bias[..self.biases]);
         Ok(())
     }
 }
@@ -202,17 +248,25 @@ impl Chain {
     fn run(isa: Isa, x: &Tensor, links: &[Link]) -> Result<Tensor> {
         let isa = isa.checked().map_err(Error::wrap)?;
         let (_, mut channels, ..) = x.dims4()?;
-        let (mut layers, mut at) = (Vec::new(), 0);
-        for Link { weight, bias, opts } in links {
+        let (mut layers, mut at): (Vec<Layer>, _) = (Vec::new(), 0);
+        for (i, Link { weight, bias, opts, onto }) in links.iter().enumerate() {
             let outputs = filter_channels(weight.dims4()?, channels, opts.groups)?;
             let biases = bias.as_ref().map_or(0, |b| b.elem_count());
             if bias.is_some() && biases != outputs {
                 candle_core::bail!("conv3x3: {biases} biases for {outputs} channels");
             }
             let wants = (weight.track_op(), bias.as_ref().is_some_and(|b| b.track_op()));
-            layers.push(Layer { opts: *opts, inputs: channels, outputs, at, biases, wants });
+            let onto = *onto;
+            if let Some(earlier) = onto {
+                let shuffles = opts.stride == 1 && opts.groups == 1 && !opts.relu && biases == 0 && i + 1 < links.len();
+                let fits = layers.get(earlier).is_some_and(|l| l.onto.is_none() && 4 * l.outputs == outputs);
+                if !(shuffles && fits) {
+                    candle_core::bail!("conv_chain: layer {i} of {outputs} channels cannot go onto layer {earlier}");
+                }
+            }
+            layers.push(Layer { opts: *opts, inputs: channels, outputs, at, biases, wants, onto });
             at += weight.elem_count() + biases;
-            channels = outputs;
+            channels = if onto.is_some() { outputs / 4 } else { outputs };
         }
         let flat = links.iter().flat_map(Link::tensors).map(|t| t.flatten_all()).collect::<Result<Vec<_>>>()?;
         let halves = isa == Isa::Amx && links.iter().all(|link| link.opts.precision == Precision::Bf16);
@@ -226,29 +280,56 @@ impl Chain {
         if self.wants_input_grad { Some(0) } else { self.layers.iter().position(|l| l.wants.0 || l.wants.1) }
     }
 
+    /// Sizes `(C, H, W)` of an image on its way: what goes into each layer, and the result.
+    fn shapes(&self, first: (usize, usize, usize)) -> Result<Vec<(usize, usize, usize)>> {
+        let mut shapes = vec![first];
+        for (i, layer) in self.layers.iter().enumerate() {
+            let (_, h, w) = shapes[i];
+            let [h, w] = [h, w].map(|n| n.div_ceil(layer.opts.stride));
+            shapes.push(match layer.onto {
+                None => (layer.outputs, h, w),
+                Some(earlier) if shapes[earlier + 1] == (layer.outputs / 4, 2 * h, 2 * w) => shapes[earlier + 1],
+                Some(earlier) => candle_core::bail!(
+                    "conv_chain: twice {h}×{w}, of layer {i}, is not the size {:?} of layer {earlier}",
+                    shapes[earlier + 1]
+                ),
+            });
+        }
+        Ok(shapes)
+    }
+
     /// One image `[C,H,W]` through all layers; what is to be kept of it.
     fn image(&self, convs: &[PackedConv], x: &[f32], [c, h, w]: [usize; 3], y: &mut [f32]) -> Checked<Vec<Blocked>> {
-        let (keep, mut kept) = (self.first_wanted().is_some(), Vec::new());
+        let keep = self.first_wanted().is_some();
         let mut image = IMAGES.take(Form::Single, (c, h, w));
         image.read_planes(c, h, w, x)?;
-        image = to_form(image, self.form);
+        // What goes into each layer, then the result.
+        let mut images = vec![to_form(image, self.form)];
         Scratch::lend(|scratch| {
-            for conv in convs {
+            for (i, (layer, conv)) in self.layers.iter().zip(convs).enumerate() {
+                let image = &images[i];
                 let (_, h, w) = image.shape();
-                let mut next = IMAGES.take(conv.form(), conv.out_shape(h, w));
-                conv.forward(&image, &mut next, scratch)?;
-                let before = std::mem::replace(&mut image, next);
-                if keep { kept.push(before) } else { IMAGES.give([before]) }
+                let next = match layer.onto {
+                    None => {
+                        let mut next = IMAGES.take(conv.form(), conv.out_shape(h, w));
+                        conv.forward(image, &mut next, scratch)?;
+                        next
+                    }
+                    Some(earlier) => onto(conv, image, &images[earlier + 1], scratch)?,
+                };
+                images.push(next);
+                let read_again = |later: &Layer| later.onto.is_some_and(|earlier| earlier + 1 == i);
+                if !keep && !self.layers[i..].iter().any(read_again) {
+                    IMAGES.give([std::mem::take(&mut images[i])]);
+                }
             }
             Checked::Ok(())
         })?;
-        image.write_planes(y)?;
-        if keep && self.layers.last().is_some_and(|l| l.opts.relu) {
-            kept.push(image);
-        } else {
-            IMAGES.give([image]);
+        images[self.layers.len()].write_planes(y)?;
+        if !(keep && self.layers.last().is_some_and(|l| l.opts.relu)) {
+            IMAGES.give(images.pop());
         }
-        Ok(kept)
+        Ok(images)
     }
 
     /// From the gradients by the result of each image: those by its input if they are wanted, and those by the parameters.
@@ -256,6 +337,8 @@ impl Chain {
         let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         let mut all = vec![0.0; params.len()];
         let first = self.first_wanted().unwrap_or(self.layers.len());
+        // By the result of a layer, from the layers that went onto it.
+        let mut around: Vec<Vec<Blocked>> = vec![Vec::new(); self.layers.len()];
         for (i, layer) in self.layers.iter().enumerate().skip(first).rev() {
             let inputs: Vec<&Blocked> = kept.iter().map(|kept| &kept[i]).collect();
             // Halved gradients of stride 2 are widened to stride 1.
@@ -263,19 +346,26 @@ impl Chain {
                 step if step == Step::Same || self.form == Form::Half => (Step::Same, Step::Same),
                 step => (step, Step::Double),
             };
+            let ways = std::mem::take(&mut around[i]);
+            grads.par_iter_mut().zip(&ways).for_each(|(grad, way)| add(grad, way));
+            IMAGES.give(ways);
             grads.par_iter_mut().zip(&*kept).for_each(|(grad, kept)| {
                 if layer.opts.relu {
                     mask(grad, &kept[i + 1]);
                 }
                 *grad = to_form(std::mem::take(grad), self.form);
             });
+            if let Some(earlier) = layer.onto {
+                let both = grads.into_par_iter().map(|grad| (unshuffled(&grad), grad));
+                (grads, around[earlier]) = both.unzip();
+            }
             if self.form == Form::Half && layer.opts.stride == 2 {
                 grads.par_iter_mut().zip(&inputs).for_each(|(grad, input)| widen_stride(grad, input));
             }
             layer.parameter_grads(self.isa, step, &inputs, &grads, &mut all)?;
             if i > first || self.wants_input_grad {
                 let form = if i == 0 { Form::Single } else { self.form };
-                let conv = layer.adjoint(self.isa, params, back)?.giving(form);
+                let conv = layer.adjoint(self.isa, params, back, self.form)?.giving(form);
                 grads.par_iter_mut().zip(inputs).try_for_each(|(grad, input)| {
                     let (channels, height, width) = input.shape();
                     let mut dx = IMAGES.take(form, (channels, height, width));
@@ -293,6 +383,43 @@ impl Drop for Chain {
     fn drop(&mut self) {
         let kept = self.kept.get_mut().unwrap_or_else(PoisonError::into_inner);
         IMAGES.give(kept.drain(..).flatten());
+    }
+}
+
+/// The pixel-shuffled result of `conv`, added to a copy of `earlier`.
+fn onto(conv: &PackedConv, image: &Blocked, earlier: &Blocked, scratch: &mut Scratch) -> Checked<Blocked> {
+    let mut sum = IMAGES.take(earlier.form(), earlier.shape());
+    sum.pixels_mut().copy_from_slice(earlier.pixels());
+    if sum.form() == Form::Single {
+        let (_, h, w) = image.shape();
+        let mut quarters = IMAGES.take(conv.form(), conv.out_shape(h, w));
+        conv.forward(image, &mut quarters, scratch)?;
+        shuffle::add_shuffled(&quarters, &mut sum);
+        IMAGES.give([quarters]);
+    } else {
+        conv.add_shuffled(image, &mut sum, scratch)?;
+    }
+    Ok(sum)
+}
+
+/// The gradient by what was shuffled onto an image, from that by the sum.
+fn unshuffled(grad: &Blocked) -> Blocked {
+    let (channels, h, w) = grad.shape();
+    let padded = channels.next_multiple_of(shuffle::block(grad.form()));
+    let mut quarters = IMAGES.take(grad.form(), (4 * padded, h / 2, w / 2));
+    shuffle::unshuffle(grad, &mut quarters);
+    quarters
+}
+
+/// `sum += other`, of one form and shape.
+fn add(sum: &mut Blocked, other: &Blocked) {
+    if sum.form() == Form::Half {
+        // SAFETY: only the matrix unit makes images of this form.
+        return unsafe { half::add(sum, other) };
+    }
+    let (_, height, _) = sum.shape();
+    for (block, y) in (0..sum.blocks()).flat_map(|block| (0..height).map(move |y| (block, y))) {
+        sum.row_mut(block, y).iter_mut().zip(other.row(block, y)).for_each(|(sum, other)| *sum += other);
     }
 }
 
@@ -402,12 +529,12 @@ impl CustomOp2 for Chain {
         }
         let (x, params) = (numbers(x, x_layout)?, numbers(params, params_layout)?);
         let last = self.layers.len() - 1;
+        let shape = self.shapes((c, h, w))?[last + 1];
         let packed = |(i, layer): (usize, &Layer)| {
             let form = if i == last { Form::Single } else { self.form };
-            layer.packed(self.isa, params).map(|conv| conv.giving(form))
+            layer.packed(self.isa, params, self.form).map(|conv| conv.giving(form))
         };
         let convs = self.layers.par_iter().enumerate().map(packed).collect::<Checked<Vec<_>>>().map_err(Error::wrap)?;
-        let shape = convs.iter().fold((c, h, w), |(_, h, w), conv| conv.out_shape(h, w));
         let each = shape.0 * shape.1 * shape.2;
         let mut y = vec![0.0; n * each];
         let images = x.par_chunks_exact(c * h * w).zip(y.par_chunks_exact_mut(each));
