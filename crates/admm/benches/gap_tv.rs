@@ -14,7 +14,7 @@ fn gap_tv(c: &mut Criterion) {
         let noisy = (&truth + &uniform(shape.dim(), 1)).insert_axis(Axis(1));
         let mut out = Array4::zeros(noisy.dim());
         let mut tv = Tv::new(0.3);
-        let cx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
+        let cx = DenoiseCx::new(0.0);
         // One call reads the frame and reads and writes two duals and the output in each of its five passes.
         group.throughput(Throughput::Bytes((5 * 7 * noisy.len() * size_of::<f32>()) as u64));
         group.bench_function("tv", |b| b.iter(|| tv.denoise(&cx, noisy.view(), out.view_mut())));

@@ -12,6 +12,16 @@ pub struct DenoiseCx {
     pub iteration: usize,
     /// The stage of the schedule, counted from 0.
     pub stage: usize,
+    /// The root mean square error of the result, in units of a frame's full scale, that the solve would not notice: a share of the
+    /// predicted error of the iterates where pixels are held out ([`HoldOut`](crate::HoldOut)), else 0.
+    pub tolerance: f32,
+}
+
+impl DenoiseCx {
+    /// A first call with this σ; no error is tolerated.
+    pub const fn new(sigma: f32) -> Self {
+        Self { sigma, iteration: 0, stage: 0, tolerance: 0.0 }
+    }
 }
 
 /// Removes noise of a given strength from a video: the proximal step `v = D_σ(x)` of plug-and-play methods.

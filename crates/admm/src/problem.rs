@@ -117,7 +117,7 @@ fn admm_tv(problem: &Problem<'_>, iterations: usize, mut tv: impl Denoiser) -> R
         let step = DataStep { damping: 0.01, ..DataStep::projection(problem.y) };
         problem.operator.data_step(step, p.view(), x.view_mut());
         Zip::from(&mut p).and(&x).and(&b).par_for_each(|z, &x, &b| *z = x - b);
-        let cx = DenoiseCx { sigma: 0.0, iteration, stage: 0 };
+        let cx = DenoiseCx { iteration, ..DenoiseCx::new(0.0) };
         tv.denoise(&cx, p.view().insert_axis(Axis(1)), theta.view_mut().insert_axis(Axis(1)))
             .map_err(|source| SolveError::Denoiser { name: tv.name().into(), iteration, source })?;
         // b ← b − (x − θ) = θ − (x − b).

@@ -186,7 +186,8 @@ pub fn run<S: Solver>(
         for left in (0..count).rev() {
             clock.resume();
             let iteration = iterations;
-            let cx = DenoiseCx { sigma, iteration, stage };
+            let tolerance = judge.as_ref().map_or(0.0, |judge| judge.tolerance());
+            let cx = DenoiseCx { sigma, iteration, stage, tolerance };
             let progress = solver.step(&given, &cx, &mut state).map_err(|source| {
                 let name = solver.denoiser_name().to_owned();
                 SolveError::Denoiser { name, iteration, source }

@@ -421,7 +421,7 @@ mod tests {
     use sci_forward::VideoShape;
     use sci_forward::testing::{moving_square, uniform};
 
-    const CX: DenoiseCx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
+    const CX: DenoiseCx = DenoiseCx::new(0.0);
 
     #[test]
     fn the_fast_path_is_the_definition_at_every_size() {

@@ -263,7 +263,7 @@ fn the_four_patterns_give_the_same_result_up_to_the_shift() {
 fn sub_lattices_are_denoised_apart() {
     let noisy = uniform((2, 1, 20, 24), 3);
     let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
-    let cx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
+    let cx = DenoiseCx::new(0.0);
     PerLattice::new(Tv::new(0.1)).denoise(&cx, noisy.view(), out.view_mut()).unwrap();
     for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
         let lattice = noisy.slice(s![.., .., row..;2, column..;2]).to_owned();

@@ -98,7 +98,7 @@ fn tiled(
 ) -> (Vec<Array4<f32>>, Vec<Array4<f32>>, TileCounts) {
     let counts = Rc::new(Cell::new(TileCounts::default()));
     let mut tiles = Tiles::new(Blur, config, still, Rc::clone(&counts));
-    let cx = DenoiseCx { sigma: 0.1, iteration: 0, stage: 0 };
+    let cx = DenoiseCx::new(0.1);
     let call = |d: &mut dyn Denoiser, x: &Array4<f32>| {
         let mut out = Array4::from_elem(x.dim(), f32::NAN);
         d.denoise(&cx, x.view(), out.view_mut()).unwrap();

@@ -48,7 +48,7 @@ fn tv_matches_scikit_image() {
     let input: Array3<f32> = npz.by_name("input").unwrap();
     let expected: Array3<f32> = npz.by_name("output").unwrap();
     let mut out = Array4::zeros(input.clone().insert_axis(Axis(1)).dim());
-    let cx = DenoiseCx { sigma: 0.0, iteration: 0, stage: 0 };
+    let cx = DenoiseCx::new(0.0);
     Tv::new(0.3).denoise(&cx, input.view().insert_axis(Axis(1)), out.view_mut()).unwrap();
     let worst = (out.remove_axis(Axis(1)) - expected).fold(0f32, |m, d| m.max(d.abs()));
     assert!(worst < 1e-5, "largest difference {worst}");

@@ -13,7 +13,7 @@ fn pass(c: &mut Criterion, name: &str, net: &mut dyn Denoiser, channels: usize) 
     let video =
         Array4::from_shape_fn((8, channels, 256, 256), |(t, c, y, x)| ((t + c + 5 * y + 3 * x) % 17) as f32 / 17.0);
     let mut out = Array4::zeros(video.dim());
-    let cx = DenoiseCx { sigma: 0.1, iteration: 0, stage: 0 };
+    let cx = DenoiseCx::new(0.1);
     c.bench_function(name, |b| b.iter(|| net.denoise(&cx, video.view(), out.view_mut()).expect("shapes fit")));
 }
 

@@ -9,7 +9,7 @@
 //! let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0)?;
 //! let noisy = Array4::from_elem((2, 1, 9, 7), 0.5);
 //! let mut clean = Array4::zeros(noisy.dim());
-//! let cx = DenoiseCx { sigma: 25.0 / 255.0, iteration: 0, stage: 0 };
+//! let cx = DenoiseCx::new(25.0 / 255.0);
 //! net.denoise(&cx, noisy.view(), clean.view_mut())?;
 //! assert_eq!(net.describe(), "FFDNet (gray, 8 channels, 3 layers)");
 //! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
@@ -19,6 +19,7 @@ mod ddnet;
 mod error;
 mod fastdvdnet;
 mod ffdnet;
+mod frugal;
 #[cfg(test)]
 mod gradient_tests;
 mod infer;
@@ -33,6 +34,7 @@ pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};
 pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};
 pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
+pub use frugal::{Frugal, HalfCounts, Precise};
 pub use layers::Parameters;
 pub use network::{Network, Window};
 pub use video::Ends;

@@ -77,7 +77,10 @@ pub trait Network: Send + Sync {
 
     /// What inference, as a denoiser on the CPU, multiplies: f32 unless this asks for [`Precision::Bf16`].
     fn set_inference_precision(&mut self, precision: Precision) {
-        self.convs_mut().into_iter().for_each(|conv| conv.set_inference_precision(precision));
+        // What inference has packed stays unless something changes.
+        if self.convs().iter().any(|conv| conv.inference().precision != precision) {
+            self.convs_mut().into_iter().for_each(|conv| conv.set_inference_precision(precision));
+        }
     }
 
     /// What [`Network::forward`] and the gradient multiply: f32 unless this asks for [`Precision::Bf16`]. Inference

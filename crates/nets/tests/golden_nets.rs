@@ -30,7 +30,7 @@ impl Golden {
 
 fn denoise(net: &mut dyn Denoiser, noisy: &Array4<f32>, sigma: f32) -> Array4<f32> {
     let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
-    net.denoise(&DenoiseCx { sigma, iteration: 0, stage: 0 }, noisy.view(), out.view_mut()).unwrap();
+    net.denoise(&DenoiseCx::new(sigma), noisy.view(), out.view_mut()).unwrap();
     out
 }
 

@@ -6,7 +6,8 @@ use ndarray::{Array3, Array4, Axis, concatenate, s};
 use nets::kernels::{Isa, Precision};
 use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, WeightFile,
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Frugal, Network,
+    WeightFile,
 };
 use sci_forward::bayer::{Malvar, mosaic_into};
 use sci_forward::testing::{gaussian, shared_file};
@@ -17,7 +18,7 @@ use std::path::{Path, PathBuf};
 trait NetworkDenoiser: Network + Denoiser {}
 impl<N: Network + Denoiser> NetworkDenoiser for N {}
 
-const CX: DenoiseCx = DenoiseCx { sigma: 0.1, iteration: 0, stage: 0 };
+const CX: DenoiseCx = DenoiseCx::new(0.1);
 
 fn pattern(dim: (usize, usize, usize, usize)) -> Array4<f32> {
     Array4::from_shape_fn(dim, |(t, c, y, x)| ((13 * t + 7 * c + 5 * y + 3 * x) % 23) as f32 / 23.0)
@@ -134,6 +135,31 @@ fn inference_in_bf16_is_near_that_in_f32() {
         assert!(one.install(|| denoise(net.as_mut(), &video)) == found);
         net.set_inference_precision(Precision::F32);
         assert!(denoise(net.as_mut(), &video) == exact);
+    }
+}
+
+/// What is not noticed is done in bf16, what is tolerated by none in f32, and the choice is that of the error itself.
+#[test]
+fn bf16_is_for_calls_that_tolerate_its_error() {
+    let spec = FfdnetSpec { channels: 1, width: 40, depth: 5, layout: FfdnetLayout::Residual { batch_norm: false } };
+    let mut net = Ffdnet::random(spec, 4).unwrap();
+    let video = pattern((3, 1, 45, 70));
+    let exact = denoise(&mut net, &video);
+    net.set_inference_precision(Precision::Bf16);
+    let rounded = denoise(&mut net, &video);
+    let frame = |v: &Array4<f32>| v.slice(ndarray::s![..1, .., .., ..]).to_owned();
+    let difference = (frame(&rounded) - frame(&exact)).mapv(|d| f64::from(d).powi(2));
+    let error = (difference.sum() / difference.len() as f64).sqrt() as f32;
+    let on_amx = Isa::detect().unwrap() == Isa::Amx;
+    for (tolerance, halved) in [(0.0, false), (0.9 * error, false), (1.1 * error, true)] {
+        let counts = std::rc::Rc::default();
+        let mut frugal = Frugal::new(&mut net, std::rc::Rc::clone(&counts));
+        for _ in 0..2 {
+            let mut out = Array4::zeros(video.dim());
+            frugal.denoise(&DenoiseCx { tolerance, ..CX }, video.view(), out.view_mut()).unwrap();
+            assert!(out == if halved { &rounded } else { &exact }, "tolerance {tolerance}, error {error}");
+        }
+        assert_eq!(counts.get().share(), f64::from(u8::from(halved && on_amx)));
     }
 }
 

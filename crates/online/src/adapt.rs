@@ -6,9 +6,10 @@ use crate::{
 use admm::{BoxError, DenoiseCx, Denoiser};
 use candle_core::{Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, Zip, s};
-use nets::Network;
+use nets::kernels::Precision;
 use nets::train::Adam;
 use nets::weights::{Storage, WeightFile, write_safetensors};
+use nets::{Network, Precise};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
@@ -375,6 +376,12 @@ fn flipped(video: ArrayView4<'_, f32>, flip: u32) -> ArrayView4<'_, f32> {
         1 => video.slice_move(s![.., .., .., ..;-1]),
         2 => video.slice_move(s![.., .., ..;-1, ..;-1]),
         _ => video.slice_move(s![..;-1, .., .., ..]),
+    }
+}
+
+impl<N: Network + Denoiser> Precise for AdaptiveDenoiser<N> {
+    fn compute_in(&mut self, precision: Precision) {
+        self.net.set_inference_precision(precision);
     }
 }
 

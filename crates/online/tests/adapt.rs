@@ -37,7 +37,7 @@ fn bytes(net: &dyn Network) -> BTreeMap<String, Vec<u32>> {
 
 fn denoise(denoiser: &mut impl Denoiser, iteration: usize, x: &Array4<f32>) -> Array4<f32> {
     let mut v = Array4::zeros(x.dim());
-    denoiser.denoise(&DenoiseCx { sigma: 0.1, iteration, stage: 0 }, x.view(), v.view_mut()).unwrap();
+    denoiser.denoise(&DenoiseCx { iteration, ..DenoiseCx::new(0.1) }, x.view(), v.view_mut()).unwrap();
     v
 }
 

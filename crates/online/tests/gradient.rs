@@ -32,7 +32,7 @@ fn upstream<N: Network + Denoiser>(
     x: ArrayView4<'_, f32>,
 ) -> Array4<f32> {
     let mut v = Array4::zeros(x.dim());
-    net.denoise(&DenoiseCx { sigma: SIGMA, iteration: 0, stage: 0 }, x, v.view_mut()).unwrap();
+    net.denoise(&DenoiseCx::new(SIGMA), x, v.view_mut()).unwrap();
     snapshot.pull_back(pixels.gradient(snapshot.residual(v.view()).unwrap().view()).view())
 }
 
@@ -169,7 +169,7 @@ fn the_gradient_equals_pytorchs() {
 
     let sigma = *sigma.first().unwrap() as f32;
     let mut v = Array4::zeros(x.dim());
-    net.denoise(&DenoiseCx { sigma, iteration: 0, stage: 0 }, x.view(), v.view_mut()).unwrap();
+    net.denoise(&DenoiseCx::new(sigma), x.view(), v.view_mut()).unwrap();
     let residual = snapshot.residual(v.view()).unwrap();
     let (found, expected) = (pixels.loss(residual.view()).loss, *loss.first().unwrap());
     assert!((found / expected - 1.0).abs() < 1e-4, "loss {found} instead of {expected}");
@@ -208,7 +208,7 @@ fn one_weight_moved_changes_the_loss_as_the_gradient_says() {
             moved[index] += by;
             var.set(&Tensor::from_vec(moved, var.shape(), &Device::Cpu).unwrap()).unwrap();
             let mut v = Array4::zeros(x.dim());
-            net.denoise(&DenoiseCx { sigma: SIGMA, iteration: 0, stage: 0 }, x.view(), v.view_mut()).unwrap();
+            net.denoise(&DenoiseCx::new(SIGMA), x.view(), v.view_mut()).unwrap();
             pixels.loss(snapshot.residual(v.view()).unwrap().view()).loss
         };
         let slope = (loss(step) - loss(-step)) / f64::from(2.0 * step);

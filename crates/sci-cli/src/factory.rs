@@ -11,7 +11,8 @@ use admm::{
 };
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
-use nets::Network;
+use nets::kernels::Precision;
+use nets::{Frugal, HalfCounts, Network};
 use online::{AdaptiveDenoiser, Counts, Sequence, Snapshot, Task, Update};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer};
@@ -152,9 +153,9 @@ impl<'e> Factory<'e> {
         let calls = Rc::new(Cell::new(0));
         let color = self.color.as_ref();
         let begin = Instant::now();
-        let tiles = StillTiles::of(self.experiment, problem);
+        let saving = Saving::of(self.experiment, problem);
         let looked = begin.elapsed().as_secs_f64();
-        let inner = denoiser(self.experiment, &mut self.parts, color, &tiles);
+        let inner = denoiser(self.experiment, &mut self.parts, color, &saving);
         let denoiser = Counted { inner, calls: Rc::clone(&calls) };
         let mut outcome = match (self.experiment.solver, color) {
             (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
@@ -180,7 +181,8 @@ impl<'e> Factory<'e> {
             sensor.complete(&mut outcome)?;
         }
         outcome.seconds += looked;
-        Ok((outcome, Work { calls: calls.get(), skipped_tiles: tiles.counts.get().skipped() }))
+        let (skipped_tiles, halved) = (saving.tiles.get().skipped(), saving.halves.get().share());
+        Ok((outcome, Work { calls: calls.get(), skipped_tiles, halved }))
     }
 
     /// Writes the weights as they are now, of each network one file `adapted-N-KIND.safetensors`, N its place among the
@@ -225,18 +227,22 @@ fn denoiser<'p>(
     experiment: &Experiment,
     parts: &'p mut [Part],
     color: Option<&Sensor>,
-    tiles: &StillTiles,
+    saving: &Saving,
 ) -> PerStage<'p> {
     let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
-    let denoisers = parts.iter_mut().map(|part| match (part, on_mosaic) {
-        (Part::Tv { weight, inner }, sensor) => {
-            let tv = Tv::new(*weight).inner(*inner);
-            if sensor.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) }
+    let denoisers = parts.iter_mut().zip(&experiment.denoisers).map(|(part, choice)| {
+        let network = match part {
+            Part::Tv { weight, inner } => {
+                let tv = Tv::new(*weight).inner(*inner);
+                return if on_mosaic.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) };
+            }
+            Part::Ffdnet(net) => saving.spare(net, choice.precision()),
+            Part::Fastdvdnet(net) => saving.spare(net, choice.precision()),
+        };
+        match on_mosaic {
+            None => network,
+            Some(s) => boxed(Demosaicked::new(network, s.demosaicer.clone(), s.cfa)),
         }
-        (Part::Ffdnet(net), None) => tiles.spare(net),
-        (Part::Fastdvdnet(net), None) => tiles.spare(net),
-        (Part::Ffdnet(net), Some(s)) => boxed(Demosaicked::new(tiles.spare(net), s.demosaicer.clone(), s.cfa)),
-        (Part::Fastdvdnet(net), Some(s)) => boxed(Demosaicked::new(tiles.spare(net), s.demosaicer.clone(), s.cfa)),
     });
     PerStage::new(denoisers.collect(), experiment.stages.iter().map(|s| s.denoiser).collect())
 }
@@ -252,28 +258,44 @@ pub struct Work {
     pub calls: usize,
     /// The share of the pixels of these calls that was left out.
     pub skipped_tiles: f64,
+    /// The share of what networks did that was in bf16 because the solve would not notice.
+    pub halved: f64,
 }
 
-/// Which tiles of a measurement stand still, for networks that may be spared them.
-struct StillTiles {
+/// What networks may be spared of a measurement.
+struct Saving {
     config: TileConfig,
-    /// Nothing when they may not.
+    /// Which tiles stand still; nothing when all are wanted.
     still: Option<Vec<bool>>,
-    counts: Rc<Cell<TileCounts>>,
+    tiles: Rc<Cell<TileCounts>>,
+    half_precision: bool,
+    halves: Rc<Cell<HalfCounts>>,
 }
 
-impl StillTiles {
-    /// A network that adapts is given everything: its updates look at the whole measurement.
+impl Saving {
+    /// A network that adapts is given everything in full: its updates look at the whole measurement.
     fn of(experiment: &Experiment, problem: &Problem<'_>) -> Self {
         let config = TileConfig::default();
-        let wanted = experiment.skip.is_some_and(|s| s.tiles) && experiment.online.is_none();
-        let still = wanted.then(|| admm::still(problem, config.side));
-        Self { config, still, counts: Rc::default() }
+        let skip = experiment.skip.filter(|_| experiment.online.is_none());
+        let still = skip.is_some_and(|s| s.tiles).then(|| admm::still(problem, config.side));
+        let half_precision = skip.is_some_and(|s| s.half_precision);
+        Self { config, still, tiles: Rc::default(), half_precision, halves: Rc::default() }
     }
 
-    fn spare<'a>(&self, net: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
+    fn spare<'a, N>(&self, net: &'a mut AdaptiveDenoiser<N>, precision: Precision) -> Box<dyn Denoiser + 'a>
+    where
+        N: Network + Denoiser,
+    {
+        if self.half_precision && precision == Precision::F32 {
+            self.spare_tiles(Frugal::new(net, Rc::clone(&self.halves)))
+        } else {
+            self.spare_tiles(net)
+        }
+    }
+
+    fn spare_tiles<'a>(&self, net: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
         match &self.still {
-            Some(still) => Box::new(Tiles::new(net, self.config, still, Rc::clone(&self.counts))),
+            Some(still) => Box::new(Tiles::new(net, self.config, still, Rc::clone(&self.tiles))),
             None => Box::new(net),
         }
     }

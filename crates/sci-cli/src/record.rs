@@ -151,6 +151,9 @@ pub struct Skipped {
     pub iterations: usize,
     /// The share of tiles the denoiser left alone, 0 to 1.
     pub tiles: f64,
+    /// The share of what networks did that was in bf16 instead of f32, 0 to 1.
+    #[serde(default)]
+    pub precision: f64,
     /// Online updates that were due and not made.
     pub updates: usize,
 }

@@ -98,7 +98,7 @@ impl Model {
     /// Runs the network without gradients.
     fn restore(&mut self, input: ArrayView4<'_, f32>, sigma: f32) -> Result<Array4<f32>> {
         let mut out = Array4::zeros(input.dim());
-        let cx = DenoiseCx { sigma, iteration: 0, stage: 0 };
+        let cx = DenoiseCx::new(sigma);
         self.denoise(&cx, input, out.view_mut()).map_err(|e| Error::Data(e.to_string()))?;
         Ok(out)
     }

@@ -184,7 +184,12 @@ fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, tr
         relative_residual: Some(outcome.relative_residual),
         updates: counts.kept,
         denoiser_calls: work.calls,
-        skipped: Skipped { iterations: whole - planned + left, tiles: work.skipped_tiles, updates: counts.skipped },
+        skipped: Skipped {
+            iterations: whole - planned + left,
+            tiles: work.skipped_tiles,
+            precision: work.halved,
+            updates: counts.skipped,
+        },
         online: adaptation,
         trace,
     };

@@ -207,6 +207,7 @@ pub struct SkipKeys {
     pub patience: Value,
     pub overshoot: Value,
     pub tiles: Value,
+    pub half_precision: Value,
     pub cheap_first: Value,
 }
 

@@ -96,6 +96,14 @@ impl Denoiser {
             Self::Fastdvdnet { .. } => "fastdvdnet",
         }
     }
+
+    /// What a network is to multiply.
+    pub fn precision(&self) -> Precision {
+        match self {
+            Self::Tv { .. } => Precision::F32,
+            Self::Ffdnet { precision, .. } | Self::Fastdvdnet { precision, .. } => *precision,
+        }
+    }
 }
 
 /// A stage to run.
@@ -418,7 +426,7 @@ fn skip_json(s: &Skip) -> Value {
     let HoldOut { spacing, seed, gain, patience, overshoot } = s.hold_out;
     json!({
         "enabled": true, "spacing": spacing, "seed": seed, "gain": gain, "patience": patience, "overshoot": overshoot,
-        "tiles": s.tiles, "cheap_first": s.cheap_first,
+        "tiles": s.tiles, "half_precision": s.half_precision, "cheap_first": s.cheap_first,
     })
 }
 

@@ -15,6 +15,8 @@ pub struct Skip {
     pub hold_out: HoldOut,
     /// Whether networks are spared tiles that stand still or have settled.
     pub tiles: bool,
+    /// Whether networks work in bf16 where the solve would not notice.
+    pub half_precision: bool,
     /// Whether TV goes first.
     pub cheap_first: bool,
 }
@@ -43,6 +45,7 @@ impl<'s> Checker<'s> {
         let skip = Skip {
             hold_out,
             tiles: self.flag("skip.tiles", &k.tiles)?.unwrap_or(true),
+            half_precision: self.flag("skip.half_precision", &k.half_precision)?.unwrap_or(true),
             cheap_first: self.flag("skip.cheap_first", &k.cheap_first)?.unwrap_or(true),
         };
         Ok(enabled.then_some(skip))

@@ -255,7 +255,7 @@ function viewer(r, images) {
     perFrame.hidden = !set.psnr_db.length;
     perFrame.querySelectorAll("svg").forEach(n => n.remove());
     barList = set.psnr_db.length ? bars(perFrame, set.psnr_db, t => { slider.value = t; slider.dispatchEvent(new Event("input")); }) : [];
-    const parts = [[s.iterations, "iterations"], [s.tiles ? `${(100 * s.tiles).toFixed(1)} %` : 0, "of the denoiser's tiles"], [s.updates, "online updates"]].filter(([n]) => n).map(([n, what]) => `${n} ${what}`);
+    const parts = [[s.iterations, "iterations"], [s.tiles ? `${(100 * s.tiles).toFixed(1)} %` : 0, "of the denoiser's tiles"], [s.precision ? `${(100 * s.precision).toFixed(0)} %` : 0, "of the networks' work in f32"], [s.updates, "online updates"]].filter(([n]) => n).map(([n, what]) => `${n} ${what}`);
     skippedBox.textContent = `Skipped: ${parts.join(", ") || "nothing"}. Ended: ${words(m.stop)} after ${m.iterations} iterations.`;
     frame();
   }
