@@ -11,6 +11,8 @@ use std::rc::Rc;
 const BLOCK: usize = 16;
 /// Mean square deviation of frames that never wakes a tile.
 const FLOOR: f64 = (2.0 / 255.0) * (2.0 / 255.0);
+/// Frames that differ by so many σ are alike but for what the denoiser takes for noise.
+const QUIET: f32 = 1.25;
 /// A call that would save less than this share of its pixels is made in one piece.
 const LEAST_SAVED: f64 = 0.1;
 
@@ -60,7 +62,8 @@ impl TileCounts {
 ///
 /// * *Still tiles*, which the measurement tells ([`still`](crate::still)): the mean of their frames is denoised once, for all
 ///   of them. Their frames differ by what the data step adds, frame by frame, to explain the measurement; a tile whose
-///   frames come to differ by `wake` times the least of before is woken for good, as no still picture explains it.
+///   frames come to differ by `wake` times the least of before, and by more than 1.25 σ, is woken for good, as
+///   no still picture explains it.
 /// * *Settled tiles.* A tile whose input has changed by less than `settled · σ` since it was last denoised, in the same
 ///   stage, keeps its output. The solver goes on to push its input towards the measurement, so that a residual wakes it.
 ///
@@ -119,13 +122,14 @@ impl<D: Denoiser> Tiles<D> {
         self.still.resize(grid.len(), None);
         let memory = self.memory.as_ref().filter(|m| m.stage == cx.stage && m.input.dim() == noisy.dim());
         let (config, begun) = (self.config, self.memory.is_some());
+        let noise = FLOOR.max(f64::from(QUIET * cx.sigma).powi(2));
         let need = |(tile, still): (usize, &mut Option<f64>)| {
             let (rows, columns) = grid.tile(tile);
             let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
             // Before the first call nothing has made the frames alike, or unlike.
             if let (Some(least), true) = (&*still, begun) {
                 let deviation = deviation(now);
-                let awake = deviation > FLOOR.max(*least * config.wake.powi(2));
+                let awake = deviation > noise.max(*least * config.wake.powi(2));
                 *still = if awake { None } else { Some(least.min(deviation)) };
             }
             let settled = memory.is_some_and(|memory| {
