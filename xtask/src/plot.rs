@@ -65,7 +65,7 @@ impl Axis {
         let v = if self.log { 10f64.powf(v) } else { v };
         match v.abs() {
             a if a == 0.0 || (0.01..1e5).contains(&a) => format!("{}", (v * 1000.0).round() / 1000.0),
-            _ => format!("{v:.0e}"),
+            _ => format!("{v:.1e}"),
         }
     }
 
