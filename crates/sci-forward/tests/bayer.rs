@@ -5,7 +5,7 @@ use ndarray_npy::NpzReader;
 use sci_forward::bayer::{
     Bilinear, CfaPattern, Demosaicer, Malvar, Menon, mosaic_adjoint_into, mosaic_into, sub_lattice,
 };
-use sci_forward::testing::{shared_file, uniform};
+use sci_forward::testing::{gaussian, shared_file, uniform};
 
 fn demosaicers() -> [(&'static str, Box<dyn Demosaicer>); 3] {
     [("bilinear", Box::new(Bilinear)), ("malvar2004", Box::new(Malvar)), ("menon2007", Box::new(Menon))]
@@ -98,5 +98,24 @@ fn the_mosaic_and_its_adjoint_belong_together() {
         let red = cfa.red_site();
         let lattice = sub_lattice(tx.view(), red.0, red.1);
         assert_eq!(lattice, rgb.slice(s![.., 0, red.0..;2, red.1..;2]));
+    }
+}
+
+/// `⟨M m, g⟩ = ⟨m, Mᵀ g⟩`, all patterns, odd sizes.
+#[test]
+fn malvar_has_its_adjoint() {
+    for (k, cfa) in CfaPattern::ALL.into_iter().enumerate() {
+        for (height, width) in [(2, 2), (3, 5), (8, 7)] {
+            let m = gaussian((2, height, width), k as u64);
+            let g = gaussian((6, height, width), 9).into_shape_with_order((2, 3, height, width)).unwrap();
+            let mut rgb = Array4::from_elem(g.dim(), f32::NAN);
+            Malvar.demosaic(cfa, m.view(), rgb.view_mut()).unwrap();
+            let mut back = Array3::from_elem(m.dim(), f32::NAN);
+            Malvar.adjoint(cfa, g.view(), back.view_mut()).unwrap();
+            let dot = |pairs: &mut dyn Iterator<Item = (f32, f32)>| pairs.map(|(a, b)| f64::from(a * b)).sum::<f64>();
+            let one = dot(&mut rgb.iter().copied().zip(g.iter().copied()));
+            let other = dot(&mut m.iter().copied().zip(back.iter().copied()));
+            assert!((one - other).abs() < 1e-5 * one.abs().max(1.0), "{cfa:?} {height}×{width}: {one} {other}");
+        }
     }
 }

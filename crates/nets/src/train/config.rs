@@ -172,8 +172,7 @@ pub struct IteratesConfig {
     pub calls: usize,
     /// Whether those calls follow one another (the last is drawn) and the gradient goes back from each to those before it,
     /// through the solver: a call then learns what helps the next ones. The loss of each weighs half as much as that of the
-    /// next. Gray only. Default false: calls drawn at random,
-    /// each by itself.
+    /// next. Default false: calls drawn at random, each by itself.
     #[serde(default)]
     pub unrolled: bool,
     /// Frames of a measurement, the fewest and the most, drawn for each clip; 2 to 64.
@@ -315,10 +314,8 @@ impl TrainConfig {
             frames: [few, many],
             density: [thin, dense],
             gray_masks,
-            unrolled,
+            unrolled: _,
         } = iterates;
-        let gray = self.network.channels() == 1;
-        check(gray || !unrolled, "iterates.unrolled", unrolled, "false for color: demosaicing has no gradient here")?;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
         check(self.data.frames == 1, "data.frames", self.data.frames, "left out: iterates.frames says how many")?;
         check(

@@ -53,6 +53,11 @@ impl Simulated {
         &self.operator
     }
 
+    /// The pattern of a color sensor.
+    pub(super) fn cfa(&self) -> Option<CfaPattern> {
+        self.cfa
+    }
+
     /// What the solver gives the denoiser in some of its calls, drawn anew, with σ of each. Iterates of one clip are much
     /// alike, so that few of many clips teach more than all of few.
     ///

@@ -1,11 +1,11 @@
 //! Gradient-corrected linear interpolation.
 
-use super::rows::{PAD, Window};
+use super::rows::{PAD, Window, mirror};
 use super::{CfaPattern, Color, Demosaicer, check_sizes};
 use crate::BoxError;
 use multiversion::multiversion;
 use ndarray::parallel::prelude::*;
-use ndarray::{ArrayView2, ArrayView3, ArrayViewMut3, ArrayViewMut4, Axis, s};
+use ndarray::{ArrayView2, ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, s};
 
 /// Rows of one parallel task.
 const BAND: usize = 32;
@@ -34,7 +34,7 @@ impl Demosaicer for Malvar {
         mosaic: ArrayView3<'_, f32>,
         mut rgb: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        check_sizes(&mosaic, &rgb)?;
+        check_sizes(mosaic.dim(), rgb.dim())?;
         rgb.axis_iter_mut(Axis(0)).into_par_iter().zip(mosaic.axis_iter(Axis(0))).for_each(|(mut rgb, mosaic)| {
             rgb.axis_chunks_iter_mut(Axis(1), BAND)
                 .into_par_iter()
@@ -42,6 +42,69 @@ impl Demosaicer for Malvar {
                 .for_each(|(band, rgb)| demosaic_band(cfa, mosaic, band * BAND, rgb));
         });
         Ok(())
+    }
+}
+
+impl Malvar {
+    /// `mosaic = Mᵀ rgb`, M the demosaicing: what a function of a demosaicked video `[T, 3, H, W]` changes by with each sample
+    /// `[T, H, W]`, from its gradient by the video.
+    ///
+    /// # Errors
+    /// As [`Demosaicer::demosaic`].
+    ///
+    /// ```
+    /// use ndarray::{Array3, Array4};
+    /// use sci_forward::{CfaPattern, bayer::Malvar};
+    /// let mut samples = Array3::zeros((1, 4, 4));
+    /// Malvar.adjoint(CfaPattern::Rggb, Array4::ones((1, 3, 4, 4)).view(), samples.view_mut())?;
+    /// // Every filter's weights sum to 1.
+    /// assert_eq!(samples.sum(), 48.0);
+    /// # Ok::<(), sci_forward::BoxError>(())
+    /// ```
+    pub fn adjoint(
+        self,
+        cfa: CfaPattern,
+        rgb: ArrayView4<'_, f32>,
+        mut mosaic: ArrayViewMut3<'_, f32>,
+    ) -> Result<(), BoxError> {
+        check_sizes(mosaic.dim(), rgb.dim())?;
+        let (_, height, width) = mosaic.dim();
+        mosaic.fill(0.0);
+        mosaic.axis_iter_mut(Axis(0)).into_par_iter().zip(rgb.axis_iter(Axis(0))).for_each(|(mut mosaic, rgb)| {
+            for (channel, r, c) in
+                (0..3).flat_map(|k| (0..height).flat_map(move |r| (0..width).map(move |c| (k, r, c))))
+            {
+                let value = 0.125 * rgb[[channel, r, c]];
+                for (weight, sites) in filter(cfa, channel, r, c).into_iter().zip(SITES) {
+                    for &[down, right] in sites {
+                        let at = |i: usize, by: isize, n: usize| mirror(i as isize + by, n);
+                        mosaic[[at(r, down, height), at(c, right, width)]] += weight * value;
+                    }
+                }
+            }
+        });
+        Ok(())
+    }
+}
+
+/// The samples that the weights of [`filter`] belong to: m, h1, v1, d, h2, v2.
+const SITES: [&[[isize; 2]]; 6] = [
+    &[[0, 0]],
+    &[[0, -1], [0, 1]],
+    &[[-1, 0], [1, 0]],
+    &[[-1, -1], [-1, 1], [1, -1], [1, 1]],
+    &[[0, -2], [0, 2]],
+    &[[-2, 0], [2, 0]],
+];
+
+/// Eight times the weights of the samples in one color of a pixel.
+fn filter(cfa: CfaPattern, channel: usize, r: usize, c: usize) -> [f32; 6] {
+    match (cfa.color_at(r, c), channel) {
+        (color, channel) if color as usize == channel => [8.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        (Color::Green, channel) if cfa.color_at(r, c + 1) as usize == channel => [5.0, 4.0, 0.0, -1.0, -1.0, 0.5],
+        (Color::Green, _) => [5.0, 0.0, 4.0, -1.0, 0.5, -1.0],
+        (_, channel) if channel == Color::Green as usize => [4.0, 2.0, 2.0, 0.0, -1.0, -1.0],
+        _ => [6.0, 0.0, 0.0, 2.0, -1.5, -1.5],
     }
 }
 

@@ -24,7 +24,7 @@ impl Demosaicer for Menon {
         mosaic: ArrayView3<'_, f32>,
         mut rgb: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        check_sizes(&mosaic, &rgb)?;
+        check_sizes(mosaic.dim(), rgb.dim())?;
         rgb.axis_iter_mut(Axis(0))
             .into_par_iter()
             .zip(mosaic.axis_iter(Axis(0)))

@@ -75,8 +75,8 @@ pub struct MosaicTooSmall {
 /// # Panics
 /// If `rgb` is not the mosaic's `[T, 3, H, W]`.
 #[track_caller]
-fn check_sizes(mosaic: &ArrayView3<'_, f32>, rgb: &ArrayViewMut4<'_, f32>) -> Result<(), MosaicTooSmall> {
-    let (frames, height, width) = mosaic.dim();
-    assert_eq!(rgb.dim(), (frames, 3, height, width), "the RGB video must have the mosaic's size");
+fn check_sizes(mosaic: (usize, usize, usize), rgb: (usize, usize, usize, usize)) -> Result<(), MosaicTooSmall> {
+    let (frames, height, width) = mosaic;
+    assert_eq!(rgb, (frames, 3, height, width), "the RGB video must have the mosaic's size");
     if height < 2 || width < 2 { Err(MosaicTooSmall { height, width }) } else { Ok(()) }
 }
