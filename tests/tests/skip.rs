@@ -74,14 +74,18 @@ fn tv_goes_first_only_once() {
 }
 
 #[test]
-fn networks_for_iterates_are_refused() {
+fn what_the_default_cannot_do_with_its_network_is_refused() {
     let bench = Bench::new();
     std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
-    let refused = bench
-        .finish(bench.command(&["run", "--out", "out", "--set", "skip.enabled=true"]).arg(bench.path("default.toml")));
-    assert_eq!(refused.code, 2, "{}", refused.stderr);
-    for part in ["bundled:fastdvdnet_gray_sci", "bundled:fastdvdnet_gray\"", "skip.enabled = false"] {
-        assert!(refused.stderr.contains(part), "{}", refused.stderr);
+    let holes = ["bundled:fastdvdnet_gray_sci", "bundled:fastdvdnet_gray\"", "skip.enabled = false"];
+    let flips = ["[online]", "denoiser.flips = false", "online.enabled = false"];
+    for (set, parts) in [("skip.enabled=true", holes), ("online.enabled=true", flips)] {
+        let refused =
+            bench.finish(bench.command(&["run", "--out", "out", "--set", set]).arg(bench.path("default.toml")));
+        assert_eq!(refused.code, 2, "{}", refused.stderr);
+        for part in parts {
+            assert!(refused.stderr.contains(part), "{}", refused.stderr);
+        }
+        assert!(!bench.path("out").exists());
     }
-    assert!(!bench.path("out").exists());
 }

@@ -21,6 +21,7 @@
 
 mod admm;
 mod color;
+mod flips;
 mod gap;
 mod guard;
 mod held_out;
@@ -39,6 +40,7 @@ mod two_stage;
 
 pub use admm::Admm;
 pub use color::{Demosaicked, PerLattice};
+pub use flips::Flips;
 pub use gap::{Gap, MomentumStart};
 pub use held_out::HoldOut;
 pub use observer::{IterInfo, Observer};

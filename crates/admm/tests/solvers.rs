@@ -285,3 +285,32 @@ fn the_trace_is_monotone_in_time_and_counts_from_zero() {
     assert_eq!(iterations, Array1::from_iter(0..5));
     assert!(trace.0.windows(2).all(|w| w[0].1 < w[1].1));
 }
+
+#[test]
+fn every_iteration_turns_the_video_another_way_round_and_back() {
+    // A blur that leans to the right, downwards and forwards in time.
+    let lean = |noisy: ArrayView4<'_, f32>| {
+        Array4::from_shape_fn(noisy.dim(), |(t, c, y, x)| {
+            0.5 * (noisy[[t, c, y, x]] + noisy[[t.saturating_sub(1), c, y.saturating_sub(1), x.saturating_sub(1)]])
+        })
+    };
+    let noisy = uniform((3, 5, 7), 1).insert_axis(Axis(1));
+    let mut seen: Vec<Array4<f32>> = Vec::new();
+    for iteration in 0..16 {
+        let turned = |axis: &usize| iteration >> [3, 2, 0].iter().position(|a| a == axis).unwrap() & 1 == 1;
+        let axes = || [3, 2, 0].into_iter().filter(turned).map(Axis);
+        let mut input = noisy.clone();
+        axes().for_each(|axis| input.invert_axis(axis));
+        let mut expected = lean(input.view());
+        axes().for_each(|axis| expected.invert_axis(axis));
+
+        let mut found = Array4::from_elem(noisy.dim(), f32::NAN);
+        let cx = DenoiseCx { iteration, ..DenoiseCx::new(0.1) };
+        Flips::new(Map(|_: &DenoiseCx, x: ArrayView4<'_, f32>| lean(x)))
+            .denoise(&cx, noisy.view(), found.view_mut())
+            .unwrap();
+        assert_eq!(found, expected, "iteration {iteration}");
+        assert_eq!(seen.contains(&found), iteration >= 8, "eight ways round, then again");
+        seen.push(found);
+    }
+}

@@ -6,8 +6,8 @@ use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use admm::{
-    Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Gap, MomentumStart, Observer, Outcome, PerLattice, PerStage,
-    Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage,
+    Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, MomentumStart, Observer, Outcome, PerLattice,
+    PerStage, Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage,
 };
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
@@ -17,7 +17,7 @@ use online::{AdaptiveDenoiser, Counts, Sequence, Snapshot, Task, Update};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer};
 
-use crate::config::check::{Momentum, Solver, Start as StartChoice};
+use crate::config::check::{Inference, Momentum, Solver, Start as StartChoice};
 use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment, Online};
 use crate::io::scene::Scene;
 use crate::record::Adaptation;
@@ -42,25 +42,25 @@ enum Part {
     /// Built anew for each measurement, as it may carry state from call to call.
     Tv { weight: f32, inner: usize },
     /// Loaded once. Without a measurement it is the network itself.
-    Ffdnet(AdaptiveDenoiser<nets::Ffdnet>),
+    Ffdnet(AdaptiveDenoiser<nets::Ffdnet>, Inference),
     /// Loaded once.
-    Fastdvdnet(AdaptiveDenoiser<nets::Fastdvdnet>),
+    Fastdvdnet(AdaptiveDenoiser<nets::Fastdvdnet>, Inference),
 }
 
 impl Part {
     fn prepare(&mut self, task: &Task) -> online::Result<()> {
         match self {
             Self::Tv { .. } => Ok(()),
-            Self::Ffdnet(net) => task.prepare(net),
-            Self::Fastdvdnet(net) => task.prepare(net),
+            Self::Ffdnet(net, _) => task.prepare(net),
+            Self::Fastdvdnet(net, _) => task.prepare(net),
         }
     }
 
     fn updates(&self) -> &[Update] {
         match self {
             Self::Tv { .. } => &[],
-            Self::Ffdnet(net) => net.updates(),
-            Self::Fastdvdnet(net) => net.updates(),
+            Self::Ffdnet(net, _) => net.updates(),
+            Self::Fastdvdnet(net, _) => net.updates(),
         }
     }
 }
@@ -195,8 +195,8 @@ impl<'e> Factory<'e> {
             let path = dir.join(format!("adapted-{i}-{}.safetensors", choice.kind()));
             match part {
                 Part::Tv { .. } => {}
-                Part::Ffdnet(net) => net.save(&path)?,
-                Part::Fastdvdnet(net) => net.save(&path)?,
+                Part::Ffdnet(net, _) => net.save(&path)?,
+                Part::Fastdvdnet(net, _) => net.save(&path)?,
             }
         }
         Ok(())
@@ -230,14 +230,14 @@ fn denoiser<'p>(
     saving: &Saving,
 ) -> PerStage<'p> {
     let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
-    let denoisers = parts.iter_mut().zip(&experiment.denoisers).map(|(part, choice)| {
+    let denoisers = parts.iter_mut().map(|part| {
         let network = match part {
             Part::Tv { weight, inner } => {
                 let tv = Tv::new(*weight).inner(*inner);
                 return if on_mosaic.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) };
             }
-            Part::Ffdnet(net) => saving.spare(net, choice.precision()),
-            Part::Fastdvdnet(net) => saving.spare(net, choice.precision()),
+            Part::Ffdnet(net, inference) => saving.spare(net, *inference),
+            Part::Fastdvdnet(net, inference) => saving.spare(net, *inference),
         };
         match on_mosaic {
             None => network,
@@ -282,14 +282,16 @@ impl Saving {
         Self { config, still, tiles: Rc::default(), half_precision, halves: Rc::default() }
     }
 
-    fn spare<'a, N>(&self, net: &'a mut AdaptiveDenoiser<N>, precision: Precision) -> Box<dyn Denoiser + 'a>
+    fn spare<'a, N>(&self, net: &'a mut AdaptiveDenoiser<N>, inference: Inference) -> Box<dyn Denoiser + 'a>
     where
         N: Network + Denoiser,
     {
-        if self.half_precision && precision == Precision::F32 {
-            self.spare_tiles(Frugal::new(net, Rc::clone(&self.halves)))
-        } else {
-            self.spare_tiles(net)
+        let halves = self.half_precision && inference.precision == Precision::F32;
+        match (halves, inference.flips) {
+            (false, false) => self.spare_tiles(net),
+            (false, true) => self.spare_tiles(Flips::new(net)),
+            (true, false) => self.spare_tiles(Frugal::new(net, Rc::clone(&self.halves))),
+            (true, true) => self.spare_tiles(Flips::new(Frugal::new(net, Rc::clone(&self.halves)))),
         }
     }
 
@@ -336,17 +338,17 @@ fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>
     };
     Ok(match choice {
         DenoiserChoice::Tv { weight, inner } => Part::Tv { weight: *weight, inner: *inner },
-        DenoiserChoice::Ffdnet { weights, precision } => {
+        DenoiserChoice::Ffdnet { weights, inference } => {
             let mut net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
             fits(&net, weights)?;
-            net.set_inference_precision(*precision);
-            Part::Ffdnet(AdaptiveDenoiser::new(net, adapt)?)
+            net.set_inference_precision(inference.precision);
+            Part::Ffdnet(AdaptiveDenoiser::new(net, adapt)?, *inference)
         }
-        DenoiserChoice::Fastdvdnet { weights, ends, precision } => {
+        DenoiserChoice::Fastdvdnet { weights, ends, inference } => {
             let mut net = nets::Fastdvdnet::load(weights, *ends).context("denoiser.weights")?;
             fits(&net, weights)?;
-            net.set_inference_precision(*precision);
-            Part::Fastdvdnet(AdaptiveDenoiser::new(net, adapt)?)
+            net.set_inference_precision(inference.precision);
+            Part::Fastdvdnet(AdaptiveDenoiser::new(net, adapt)?, *inference)
         }
     })
 }

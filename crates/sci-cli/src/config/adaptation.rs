@@ -38,6 +38,11 @@ impl<'s> Checker<'s> {
         let table = section.span.clone();
         let k: OnlineKeys = section.read(&[])?;
         let enabled = self.flag("online.enabled", &k.enabled)?.unwrap_or(true);
+        if enabled && denoisers.iter().any(Denoiser::flips) {
+            let message = "[online] compares what a network gives with the measurement, so that it must see the video the right way \
+                           round; legal: denoiser.flips = false, or online.enabled = false";
+            return Err(self.source.error(&table, message));
+        }
         let presets = [
             ("default", AdaptConfig::default()),
             ("paper-ffdnet", AdaptConfig::PAPER_FFDNET),

@@ -151,6 +151,15 @@ pub enum Momentum {
     Measurement,
 }
 
+/// How a network is run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Inference {
+    /// What it multiplies.
+    pub precision: Precision,
+    /// Whether it sees the video another way round in every iteration.
+    pub flips: bool,
+}
+
 /// `[denoiser]`.
 #[derive(Clone, Debug)]
 pub enum Denoiser {
@@ -165,8 +174,8 @@ pub enum Denoiser {
     Ffdnet {
         /// Weight file.
         weights: PathSetting,
-        /// What it multiplies.
-        precision: Precision,
+        /// How it is run.
+        inference: Inference,
     },
     /// FastDVDnet.
     Fastdvdnet {
@@ -174,8 +183,8 @@ pub enum Denoiser {
         weights: PathSetting,
         /// What stands for the frames before the first and after the last.
         ends: Ends,
-        /// What it multiplies.
-        precision: Precision,
+        /// How it is run.
+        inference: Inference,
     },
 }
 
@@ -185,6 +194,14 @@ impl Denoiser {
         match self {
             Self::Tv { .. } => None,
             Self::Ffdnet { weights, .. } | Self::Fastdvdnet { weights, .. } => Some(weights),
+        }
+    }
+
+    /// Whether it sees the video another way round in every iteration.
+    pub fn flips(&self) -> bool {
+        match self {
+            Self::Tv { .. } => false,
+            Self::Ffdnet { inference, .. } | Self::Fastdvdnet { inference, .. } => inference.flips,
         }
     }
 }
@@ -627,6 +644,13 @@ impl<'s> Checker<'s> {
         Ok(stages)
     }
 
+    fn inference(&self, key: &str, precision: &Value, flips: &Value) -> Result<Inference, ConfigError> {
+        Ok(Inference {
+            precision: self.precision(&format!("{key}.precision"), precision)?.unwrap_or_default(),
+            flips: self.flag(&format!("{key}.flips"), flips)?.unwrap_or(false),
+        })
+    }
+
     /// What a network multiplies.
     pub(super) fn precision(&self, key: &str, value: &Value) -> Result<Option<Precision>, ConfigError> {
         self.choice(key, value, &[("f32", Precision::F32), ("bf16", Precision::Bf16)])
@@ -646,7 +670,7 @@ impl<'s> Checker<'s> {
             "ffdnet" => {
                 let k: NetKeys = section.read(&["kind"])?;
                 Ok(Denoiser::Ffdnet {
-                    precision: self.precision(&format!("{key}.precision"), &k.precision)?.unwrap_or_default(),
+                    inference: self.inference(&key, &k.precision, &k.flips)?,
                     weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
                 })
             }
@@ -655,7 +679,7 @@ impl<'s> Checker<'s> {
                 let ends = [("circular", Ends::Circular), ("mirrored", Ends::Mirrored)];
                 Ok(Denoiser::Fastdvdnet {
                     ends: self.choice(&format!("{key}.ends"), &k.ends, &ends)?.unwrap_or_default(),
-                    precision: self.precision(&format!("{key}.precision"), &k.precision)?.unwrap_or_default(),
+                    inference: self.inference(&key, &k.precision, &k.flips)?,
                     weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
                 })
             }

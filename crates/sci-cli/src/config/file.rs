@@ -136,6 +136,7 @@ pub struct TvKeys {
 pub struct NetKeys {
     pub weights: Value,
     pub precision: Value,
+    pub flips: Value,
 }
 
 /// `[denoiser]`, `kind = "fastdvdnet"`.
@@ -145,6 +146,7 @@ pub struct NetKeys {
 pub struct VideoNetKeys {
     pub weights: Value,
     pub precision: Value,
+    pub flips: Value,
     pub ends: Value,
 }
 

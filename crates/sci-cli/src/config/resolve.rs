@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 
 use admm::{Convention, HoldOut, XStep};
 use nets::Ends;
-use nets::kernels::Precision;
 use serde_json::{Value, json};
 
-use super::check::{self, Checked, Mask, Momentum, PathSetting};
+use super::check::{self, Checked, Inference, Mask, Momentum, PathSetting};
 use super::skipping::{Skip, cheap_first};
 use super::source::{ConfigError, Place, Source};
 use crate::io::defects::Defects;
@@ -73,8 +72,8 @@ pub enum Denoiser {
     Ffdnet {
         /// Weight file, absolute.
         weights: PathBuf,
-        /// What it multiplies.
-        precision: Precision,
+        /// How it is run.
+        inference: Inference,
     },
     /// FastDVDnet.
     Fastdvdnet {
@@ -82,8 +81,8 @@ pub enum Denoiser {
         weights: PathBuf,
         /// What stands for the frames before the first and after the last.
         ends: Ends,
-        /// What it multiplies.
-        precision: Precision,
+        /// How it is run.
+        inference: Inference,
     },
 }
 
@@ -94,14 +93,6 @@ impl Denoiser {
             Self::Tv { .. } => "tv",
             Self::Ffdnet { .. } => "ffdnet",
             Self::Fastdvdnet { .. } => "fastdvdnet",
-        }
-    }
-
-    /// What a network is to multiply.
-    pub fn precision(&self) -> Precision {
-        match self {
-            Self::Tv { .. } => Precision::F32,
-            Self::Ffdnet { precision, .. } | Self::Fastdvdnet { precision, .. } => *precision,
         }
     }
 }
@@ -190,12 +181,12 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .iter()
         .map(|d| match d {
             check::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
-            check::Denoiser::Ffdnet { weights, precision } => {
-                Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)?, precision: *precision })
+            check::Denoiser::Ffdnet { weights, inference } => {
+                Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)?, inference: *inference })
             }
-            check::Denoiser::Fastdvdnet { weights, ends, precision } => {
+            check::Denoiser::Fastdvdnet { weights, ends, inference } => {
                 let weights = locate_weights(weights, source)?;
-                Ok(Denoiser::Fastdvdnet { weights, ends: *ends, precision: *precision })
+                Ok(Denoiser::Fastdvdnet { weights, ends: *ends, inference: *inference })
             }
         })
         .collect::<Result<_, ConfigError>>()?;
@@ -463,11 +454,11 @@ fn denoiser_json(d: &Denoiser) -> Value {
         Denoiser::Tv { weight, inner } => {
             json!({ "kind": "tv", "weight": weight, "inner": inner })
         }
-        Denoiser::Ffdnet { weights, precision } => {
-            json!({ "kind": "ffdnet", "weights": weights, "precision": precision })
+        Denoiser::Ffdnet { weights, inference: Inference { precision, flips } } => {
+            json!({ "kind": "ffdnet", "weights": weights, "precision": precision, "flips": flips })
         }
-        Denoiser::Fastdvdnet { weights, ends, precision } => {
-            json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends, "precision": precision })
+        Denoiser::Fastdvdnet { weights, ends, inference: Inference { precision, flips } } => {
+            json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends, "precision": precision, "flips": flips })
         }
     }
 }
