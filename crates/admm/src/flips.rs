@@ -35,8 +35,8 @@ impl<D: Denoiser> Flips<D> {
     }
 }
 
-/// The axes of `[T, C, H, W]` that an iteration turns round.
-fn axes(iteration: usize) -> impl Iterator<Item = Axis> {
+/// The axes of `[T, C, H, W]` that [`Flips`] turns round in an iteration.
+pub fn flipped_axes(iteration: usize) -> impl Iterator<Item = Axis> {
     [3, 2, 0].into_iter().enumerate().filter(move |(bit, _)| iteration >> bit & 1 == 1).map(|(_, axis)| Axis(axis))
 }
 
@@ -51,8 +51,8 @@ impl<D: Denoiser> Denoiser for Flips<D> {
         mut noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        axes(cx.iteration).for_each(|axis| noisy.invert_axis(axis));
-        axes(cx.iteration).for_each(|axis| out.invert_axis(axis));
+        flipped_axes(cx.iteration).for_each(|axis| noisy.invert_axis(axis));
+        flipped_axes(cx.iteration).for_each(|axis| out.invert_axis(axis));
         let noisy = noisy.as_standard_layout();
         let mut denoised = Array4::zeros(noisy.dim());
         self.inner.denoise(cx, noisy.view(), denoised.view_mut())?;

@@ -40,7 +40,7 @@ mod two_stage;
 
 pub use admm::Admm;
 pub use color::{Demosaicked, PerLattice};
-pub use flips::Flips;
+pub use flips::{Flips, flipped_axes};
 pub use gap::{Gap, MomentumStart};
 pub use held_out::HoldOut;
 pub use observer::{IterInfo, Observer};

@@ -3,7 +3,7 @@
 
 use super::config::IteratesConfig;
 use crate::{Error, Result};
-use admm::{BoxError, Demosaicked, DenoiseCx, Denoiser, Gap, Plan, Problem, SolveError, Stage, Start, run};
+use admm::{BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, Plan, Problem, SolveError, Stage, Start, run};
 use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use rand::{Rng, RngExt};
 use sci_forward::bayer::{Menon, mosaic_into};
@@ -11,6 +11,14 @@ use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoSha
 
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
 const START_WEIGHT: f32 = 0.1;
+
+/// A call of the denoiser.
+pub(super) struct Call {
+    /// What it is given, `[T, C, H, W]`, the right way round.
+    pub(super) input: Array4<f32>,
+    pub(super) sigma: f32,
+    pub(super) iteration: usize,
+}
 
 /// A measurement and what made it.
 #[derive(Clone)]
@@ -58,7 +66,7 @@ impl Simulated {
         self.cfa
     }
 
-    /// What the solver gives the denoiser in some of its calls, drawn anew, with σ of each. Iterates of one clip are much
+    /// What the solver gives the denoiser in some of its calls, drawn anew. Iterates of one clip are much
     /// alike, so that few of many clips teach more than all of few.
     ///
     /// # Errors
@@ -68,7 +76,7 @@ impl Simulated {
         settings: &IteratesConfig,
         denoiser: &mut dyn Denoiser,
         rng: &mut impl Rng,
-    ) -> Result<Vec<(Array4<f32>, f32)>> {
+    ) -> Result<Vec<Call>> {
         let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
         calls.sort_unstable();
         self.record(settings, denoiser, calls)
@@ -83,19 +91,15 @@ impl Simulated {
         settings: &IteratesConfig,
         denoiser: &mut dyn Denoiser,
         rng: &mut impl Rng,
-    ) -> Result<Vec<(Array4<f32>, f32)>> {
+    ) -> Result<Vec<Call>> {
         let first = rng.random_range(0..=settings.sigmas.len() - settings.calls);
         self.record(settings, denoiser, (first..first + settings.calls).collect())
     }
 
-    fn record(
-        &self,
-        settings: &IteratesConfig,
-        denoiser: &mut dyn Denoiser,
-        calls: Vec<usize>,
-    ) -> Result<Vec<(Array4<f32>, f32)>> {
+    /// The denoiser sees the video another way round in every call, as in the configurations that networks are trained for.
+    fn record(&self, settings: &IteratesConfig, denoiser: &mut dyn Denoiser, calls: Vec<usize>) -> Result<Vec<Call>> {
         let last = calls.last().copied().unwrap_or(0);
-        let mut recorder = Recorder { denoiser, calls, seen: Vec::new() };
+        let mut recorder = Recorder { denoiser: Flips::new(denoiser), calls, seen: Vec::new() };
         self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;
         Ok(recorder.seen)
     }
@@ -132,9 +136,9 @@ impl Simulated {
 
 /// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
 struct Recorder<'d> {
-    denoiser: &'d mut dyn Denoiser,
+    denoiser: Flips<&'d mut dyn Denoiser>,
     calls: Vec<usize>,
-    seen: Vec<(Array4<f32>, f32)>,
+    seen: Vec<Call>,
 }
 
 impl Denoiser for Recorder<'_> {
@@ -149,7 +153,8 @@ impl Denoiser for Recorder<'_> {
         mut out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
         if self.calls.contains(&cx.iteration) {
-            self.seen.push((noisy.as_standard_layout().into_owned(), cx.sigma));
+            let input = noisy.as_standard_layout().into_owned();
+            self.seen.push(Call { input, sigma: cx.sigma, iteration: cx.iteration });
         }
         if self.seen.len() == self.calls.len() {
             out.assign(&noisy);

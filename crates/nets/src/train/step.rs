@@ -4,12 +4,12 @@ use super::adam::Adam;
 use super::checkpoint::{self, Meta};
 use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig};
 use super::data::{TrainData, to_video};
-use super::iterates::Simulated;
+use super::iterates::{Call, Simulated};
 use super::noise::{add_noise, sensor};
 use super::unrolled::Unrolled;
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
-use admm::{DenoiseCx, Denoiser};
+use admm::{DenoiseCx, Denoiser, Flips};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
@@ -301,8 +301,8 @@ impl Trainer {
                 return Ok(vec![Lesson::Unrolled(Box::new(Unrolled { simulated, clean, calls }))]);
             }
             let calls = simulated.iterates(settings, &mut model, &mut rng)?;
-            let lesson = |(seen, sigma)| {
-                Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(seen)?, sigmas: vec![sigma] }))
+            let lesson = |Call { input, sigma, .. }| {
+                Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(input)?, sigmas: vec![sigma] }))
             };
             calls.into_iter().map(lesson).collect::<Result<Vec<_>>>()
         };
@@ -431,7 +431,8 @@ impl Trainer {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
             let simulated = Simulated::random(clean.view(), settings, &mut rng)?;
-            let restored = simulated.solve(&settings.sigmas, settings.start_iterations, model)?;
+            let restored =
+                simulated.solve(&settings.sigmas, settings.start_iterations, &mut Flips::new(&mut *model))?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;

@@ -5,19 +5,20 @@
 //! nearest samples by the curvature of the color that was seen, Menon in one direction and Malvar in both.
 
 use super::config::Loss;
-use super::iterates::Simulated;
+use super::iterates::{Call, Simulated};
 use super::step::{Gradients, gradients_of, tensor};
 use crate::{Error, Network, Result};
+use admm::flipped_axes;
 use candle_core::{Tensor, Var};
 use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
 use sci_forward::bayer::{Malvar, mosaic_adjoint_into};
 use sci_forward::{MaskOperator, SensingOperator};
 
-/// Consecutive calls of a solver: what the denoiser was given in each, with σ, and the truth.
+/// Consecutive calls of a solver, and the truth.
 pub(super) struct Unrolled {
     pub simulated: Simulated,
     pub clean: Tensor,
-    pub calls: Vec<(Array4<f32>, f32)>,
+    pub calls: Vec<Call>,
 }
 
 impl Unrolled {
@@ -30,9 +31,9 @@ impl Unrolled {
         let mut total = Gradients::zero(vars.len());
         let mut back: Option<Array4<f32>> = None;
         let mut to_momentum = Array2::zeros(operator.shape().image_dim());
-        for (input, sigma) in self.calls.iter().rev() {
-            let input = Var::from_tensor(&tensor(input.clone())?)?;
-            let v = network.forward(&input, &[*sigma])?;
+        for call in self.calls.iter().rev() {
+            let input = Var::from_tensor(&tensor(call.input.clone())?)?;
+            let v = denoised(network, &input, call)?;
             let own = (loss.mean(&(&v - &self.clean)?)? * share)?;
             let objective = match back.take() {
                 None => own.clone(),
@@ -67,6 +68,12 @@ impl Unrolled {
         mosaic_adjoint_into(cfa, to_mosaic.view(), to_v.view_mut());
         Ok(to_v)
     }
+}
+
+/// The result of a call, which sees its input as [`admm::Flips`] turns it.
+fn denoised(network: &dyn Network, input: &Tensor, call: &Call) -> Result<Tensor> {
+    let axes: Vec<usize> = flipped_axes(call.iteration).map(|axis| axis.index()).collect();
+    Ok(network.forward(&input.flip(&axes)?, &[call.sigma])?.flip(&axes)?)
 }
 
 /// From `∂ℓ/∂x` of the iterate and `∂ℓ/∂y1` of the accumulated measurement, both after the data step
@@ -136,8 +143,8 @@ mod tests {
             let mut seen = Vec::new();
             let rng = &mut ChaCha8Rng::seed_from_u64(3);
             let calls = simulated.last_calls(&settings, net as &mut dyn Denoiser, rng).unwrap();
-            for (input, sigma) in calls {
-                let v = net.forward(&tensor(input).unwrap(), &[sigma]).unwrap();
+            for call in calls {
+                let v = denoised(net, &tensor(call.input.clone()).unwrap(), &call).unwrap();
                 let error = (v - &clean).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
                 seen.push(error.iter().map(|&e| f64::from(e).powi(2)).sum::<f64>() / error.len() as f64);
             }
@@ -145,7 +152,7 @@ mod tests {
         };
         let calls = simulated.last_calls(&settings, &mut net, &mut ChaCha8Rng::seed_from_u64(3)).unwrap();
         assert_eq!(calls.len(), 3);
-        assert_eq!(calls[0].0.len_of(Axis(0)), 3);
+        assert_eq!(calls[0].input.len_of(Axis(0)), 3);
         let before = loss_at(&mut net);
         let unrolled = Unrolled { simulated: simulated.clone(), clean: clean.clone(), calls };
         let found = unrolled.gradient(&net, &vars, Loss::L2).unwrap();
