@@ -122,7 +122,7 @@ const GRAY: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\n",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n",
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
         budgets: &[1, 2, 3],
@@ -167,7 +167,7 @@ const COLOR: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\n",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n",
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
         budgets: &[1, 2, 3],

@@ -336,6 +336,10 @@ fn layers_that_cannot_be_shuffled_onto_others_are_refused() -> Result<()> {
         ),
         (vec![link(2, 2, None)?, link(8, 1, Some(0))?], "layer 1 of 8 channels cannot go onto layer 0"),
         (vec![link(2, 1, None)?, link(8, 1, Some(0))?, link(2, 1, None)?], "twice 6×6, of layer 1, is not the size"),
+        (
+            vec![link(2, 1, None)?, link(8, 1, Some(0))?, link(8, 1, Some(0))?, link(2, 1, None)?],
+            "layer 2 of 8 channels cannot go onto layer 0",
+        ),
     ] {
         let error = conv_chain(&x, &links).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");

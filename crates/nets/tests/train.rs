@@ -104,6 +104,7 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
         frames: [2, 4],
         density: [0.3, 0.7],
         gray_masks: 0.5,
+        holes: 0.1,
     });
     config
 }
@@ -174,6 +175,7 @@ fn noise_or_iterates_but_not_both() {
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().frames = [1, 4]), "iterates.frames");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().density = [0.5, 0.3]), "iterates.density");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().gray_masks = f64::NAN), "iterates.gray_masks");
+    assert_eq!(key(|c| c.iterates.as_mut().unwrap().holes = 0.6), "iterates.holes");
 }
 
 #[test]

@@ -60,7 +60,7 @@ pub struct Link {
     pub opts: Conv3x3,
     /// A way around other layers: the pixel-shuffled result, a quarter of its channels on twice the height and width, is added to
     /// the result of this earlier layer (counted from 0), and the sum goes on. Such a layer is of stride 1 and has neither groups, bias
-    /// nor ReLU; it cannot be the last.
+    /// nor ReLU; it cannot be the last, and no two go onto the same.
     pub onto: Option<usize>,
 }
 
@@ -260,7 +260,8 @@ impl Chain {
             if let Some(earlier) = onto {
                 let shuffles = opts.stride == 1 && opts.groups == 1 && !opts.relu && biases == 0 && i + 1 < links.len();
                 let fits = layers.get(earlier).is_some_and(|l| l.onto.is_none() && 4 * l.outputs == outputs);
-                if !(shuffles && fits) {
+                let alone = layers.iter().all(|l| l.onto != onto);
+                if !(shuffles && fits && alone) {
                     candle_core::bail!("conv_chain: layer {i} of {outputs} channels cannot go onto layer {earlier}");
                 }
             }
@@ -328,6 +329,9 @@ impl Chain {
         images[self.layers.len()].write_planes(y)?;
         if !(keep && self.layers.last().is_some_and(|l| l.opts.relu)) {
             IMAGES.give(images.pop());
+        }
+        if !keep {
+            IMAGES.give(images.drain(..).filter(|image| image.bytes() > 0));
         }
         Ok(images)
     }

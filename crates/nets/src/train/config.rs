@@ -182,6 +182,10 @@ pub struct IteratesConfig {
     /// Share of the clips whose masks have any transmittance. Default 0.
     #[serde(default)]
     pub gray_masks: f64,
+    /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. A network that has seen
+    /// holes stands pixels that are held out or defective. Default 0.
+    #[serde(default)]
+    pub holes: f64,
 }
 
 /// How weights follow gradients; both take the same learning rates.
@@ -314,6 +318,7 @@ impl TrainConfig {
             frames: [few, many],
             density: [thin, dense],
             gray_masks,
+            holes,
             unrolled: _,
         } = iterates;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
@@ -332,6 +337,7 @@ impl TrainConfig {
         let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
         let legal = "two shares above 0 and at most 1, the lower first";
         check(density, "iterates.density", format_args!("[{thin}, {dense}]"), legal)?;
+        check((0.0..=0.5).contains(holes), "iterates.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(gray_masks), "iterates.gray_masks", gray_masks, "0 to 1")
     }
 

@@ -7,7 +7,7 @@ use admm::{BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, Plan, Problem
 use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use rand::{Rng, RngExt};
 use sci_forward::bayer::{Menon, mosaic_into};
-use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoShape};
+use sci_forward::{CfaPattern, MaskError, MaskOperator, MaskStack, SensingOperator, VideoShape};
 
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
 const START_WEIGHT: f32 = 0.1;
@@ -31,7 +31,7 @@ pub(super) struct Simulated {
 
 impl Simulated {
     /// A clip `[T, C, H, W]` seen through new masks: binary ones of a density drawn from the range, or, for the share
-    /// `gray_masks`, any transmittance; color clips through a sensor of one of the four patterns.
+    /// `gray_masks`, any transmittance; up to the share `holes` of its pixels not measured; color clips through a sensor of one of the four patterns.
     pub(super) fn random(clip: ArrayView4<'_, f32>, settings: &IteratesConfig, rng: &mut impl Rng) -> Result<Self> {
         let (frames, channels, height, width) = clip.dim();
         let shape = VideoShape { frames, height, width };
@@ -42,7 +42,14 @@ impl Simulated {
         } else {
             MaskStack::random(shape, density, rng.random())
         };
-        let operator = MaskOperator::new(masks.map_err(|e| Error::Data(e.to_string()))?);
+        let unusable = |e: MaskError| Error::Data(e.to_string());
+        let mut masks = masks.map_err(unusable)?;
+        if settings.holes > 0.0 {
+            let share = settings.holes * rng.random::<f64>();
+            let measured = Array2::from_shape_simple_fn((height, width), || rng.random::<f64>() >= share);
+            masks = masks.restricted_to(measured.view()).map_err(unusable)?;
+        }
+        let operator = MaskOperator::new(masks);
         let pattern = CfaPattern::ALL[rng.random_range(0..4)];
         let cfa = (channels == 3).then_some(pattern);
         let y = match cfa {

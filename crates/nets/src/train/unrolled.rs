@@ -134,6 +134,7 @@ mod tests {
             frames: [3, 3],
             density: [0.5, 0.5],
             gray_masks: 0.0,
+            holes: 0.1,
         };
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let simulated = Simulated::random(clip.view(), &settings, &mut rng).unwrap();
