@@ -17,7 +17,8 @@ use online::{AdaptiveDenoiser, Counts, Sequence, Snapshot, Task, Update};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer};
 
-use crate::config::check::{Inference, Momentum, Solver, Start as StartChoice};
+use crate::config::check::{Momentum, Solver, Start as StartChoice};
+use crate::config::denoising::Inference;
 use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment, Online};
 use crate::io::scene::Scene;
 use crate::record::Adaptation;

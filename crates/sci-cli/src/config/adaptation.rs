@@ -3,7 +3,8 @@
 use nets::Parameters;
 use online::{AdaptConfig, Guard, Reuse, Schedule, SequenceConfig, Terms};
 
-use super::check::{Checker, Denoiser, MAX_ITERATIONS};
+use super::check::{Checker, MAX_ITERATIONS};
+use super::denoising::Denoiser;
 use super::file::{OnlineKeys, Section, Value};
 use super::source::ConfigError;
 

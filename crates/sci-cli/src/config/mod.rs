@@ -6,6 +6,7 @@
 
 pub mod adaptation;
 pub mod check;
+pub mod denoising;
 pub mod file;
 pub mod resolve;
 pub mod skipping;

@@ -7,7 +7,8 @@ use admm::{Convention, HoldOut, XStep};
 use nets::Ends;
 use serde_json::{Value, json};
 
-use super::check::{self, Checked, Inference, Mask, Momentum, PathSetting};
+use super::check::{self, Checked, Mask, Momentum, PathSetting};
+use super::denoising::{self, Inference};
 use super::skipping::{Skip, cheap_first};
 use super::source::{ConfigError, Place, Source};
 use crate::io::defects::Defects;
@@ -180,11 +181,11 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .denoisers
         .iter()
         .map(|d| match d {
-            check::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
-            check::Denoiser::Ffdnet { weights, inference } => {
+            denoising::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
+            denoising::Denoiser::Ffdnet { weights, inference } => {
                 Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)?, inference: *inference })
             }
-            check::Denoiser::Fastdvdnet { weights, ends, inference } => {
+            denoising::Denoiser::Fastdvdnet { weights, ends, inference } => {
                 let weights = locate_weights(weights, source)?;
                 Ok(Denoiser::Fastdvdnet { weights, ends: *ends, inference: *inference })
             }

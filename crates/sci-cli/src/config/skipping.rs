@@ -3,7 +3,8 @@
 use admm::HoldOut;
 use nets::weights::bundled_for_iterates;
 
-use super::check::{Checker, Denoiser, Momentum, Solver, Start};
+use super::check::{Checker, Momentum, Solver, Start};
+use super::denoising::Denoiser;
 use super::file::{Section, SkipKeys};
 use super::resolve::{self, Experiment, Stage};
 use super::source::ConfigError;
