@@ -48,14 +48,17 @@ impl<D: Denoiser> Gap<D> {
         Self { denoiser, momentum: Some(start), restarts: false }
     }
 
-    /// Lets y1 start anew, at y, with every stage.
+    /// Lets y1 start anew, at y, with every stage whose σ is less than seven tenths of that before, or the first.
     ///
-    /// y1 makes up for what the denoiser takes away. A stage with a smaller σ takes less, so that its first iteration
-    /// overshoots by far (3 dB) without this.
+    /// y1 makes up for what the denoiser takes away. A much smaller σ takes less, so that the first iteration with it
+    /// overshoots by far (3 dB) without this. Where σ falls little by little there is nothing to make up for.
     pub fn restarting(self) -> Self {
         Self { restarts: true, ..self }
     }
 }
+
+/// The least share of its σ that a stage leaves to the next for the momentum to go on.
+const GENTLE: f32 = 0.7;
 
 /// The iterates of [`Gap`].
 #[derive(Debug)]
@@ -68,8 +71,8 @@ pub struct GapState {
     previous: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
     y1: Option<Array2<f32>>,
-    /// The stage of the last step.
-    stage: usize,
+    /// σ of the last step.
+    sigma: f32,
 }
 
 impl GapState {
@@ -103,13 +106,15 @@ impl<D: Denoiser> Solver for Gap<D> {
             MomentumStart::Measurement => problem.y().to_owned(),
         });
         let zeros = Array3::zeros(start.dim());
-        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1, stage: 0 };
+        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1, sigma: 0.0 };
         state.project(problem);
         state
     }
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<Progress, BoxError> {
-        if std::mem::replace(&mut state.stage, cx.stage) != cx.stage && self.restarts {
+        let before = std::mem::replace(&mut state.sigma, cx.sigma);
+        let other_denoiser = (before == 0.0) != (cx.sigma == 0.0);
+        if self.restarts && (cx.sigma < GENTLE * before || other_denoiser) {
             state.restart(problem);
         }
         let GapState { x, v, previous, .. } = state;

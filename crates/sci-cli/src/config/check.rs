@@ -268,7 +268,7 @@ impl<'s> Checker<'s> {
         let skip = self.skip(skip, seed)?;
         let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named, skip.is_some())?;
         if skip.is_some() {
-            self.networks_stand_holes(&denoisers)?;
+            self.networks_suit(&denoisers)?;
         }
         let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
