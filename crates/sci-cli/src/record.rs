@@ -151,11 +151,16 @@ pub struct Skipped {
     pub iterations: usize,
     /// The share of tiles the denoiser left alone, 0 to 1.
     pub tiles: f64,
-    /// The share of what networks did that was in bf16 instead of f32, 0 to 1.
-    #[serde(default)]
+    /// The share of what networks did that was in bf16 instead of f32, 0 to 1; left out of the file where it is 0.
+    #[serde(default, skip_serializing_if = "is_none")]
     pub precision: f64,
     /// Online updates that were due and not made.
     pub updates: usize,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
+fn is_none(share: &f64) -> bool {
+    *share == 0.0
 }
 
 /// Series with one value for each iteration; empty where a quantity was not followed.
