@@ -48,7 +48,8 @@ impl<D: Denoiser> Gap<D> {
         Self { denoiser, momentum: Some(start), restarts: false }
     }
 
-    /// Lets y1 start anew, at y, with every stage whose σ is less than seven tenths of that before, or the first.
+    /// Lets y1 start anew, at y, with every stage whose σ is less than seven tenths of that before, and between stages with and
+    /// without a σ.
     ///
     /// y1 makes up for what the denoiser takes away. A much smaller σ takes less, so that the first iteration with it
     /// overshoots by far (3 dB) without this. Where σ falls little by little there is nothing to make up for.
@@ -71,8 +72,8 @@ pub struct GapState {
     previous: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
     y1: Option<Array2<f32>>,
-    /// σ of the last step.
-    sigma: f32,
+    /// σ of the last step, if there was one.
+    sigma: Option<f32>,
 }
 
 impl GapState {
@@ -106,15 +107,15 @@ impl<D: Denoiser> Solver for Gap<D> {
             MomentumStart::Measurement => problem.y().to_owned(),
         });
         let zeros = Array3::zeros(start.dim());
-        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1, sigma: 0.0 };
+        let mut state = GapState { x: zeros.clone(), previous: zeros, v: start, y1, sigma: None };
         state.project(problem);
         state
     }
 
     fn step(&mut self, problem: &Problem<'_>, cx: &DenoiseCx, state: &mut GapState) -> Result<Progress, BoxError> {
-        let before = std::mem::replace(&mut state.sigma, cx.sigma);
-        let other_denoiser = (before == 0.0) != (cx.sigma == 0.0);
-        if self.restarts && (cx.sigma < GENTLE * before || other_denoiser) {
+        // TV has no σ: from it to a network, and back, is a new beginning too.
+        let anew = |before: f32| cx.sigma < GENTLE * before || (before == 0.0) != (cx.sigma == 0.0);
+        if state.sigma.replace(cx.sigma).is_some_and(anew) && self.restarts {
             state.restart(problem);
         }
         let GapState { x, v, previous, .. } = state;
