@@ -73,15 +73,20 @@ fn from_bf16(x: u16) -> f32 {
 
 impl Amx {
     pub(super) fn new(weights: &Weights<'_>, step: Step, form: Form) -> Self {
-        let parts: &[bool] = if form == Form::Half { &[false] } else { &[true, false] };
+        let low: &[bool] = if form == Form::Half { &[false] } else { &[true, false] };
+        let parts = low.len();
         let pairs = weights.inputs.div_ceil(PAIR);
         let panels = Panel::cut(weights.outputs, 2);
-        let mut filters = Vec::with_capacity(9 * pairs * 2 * ROWS * weights.outputs.div_ceil(LANES));
-        for &panel in &panels {
-            for (tap, pair) in (0..9).flat_map(|tap| (0..pairs).map(move |pair| (tap, pair))) {
-                for &low in parts {
-                    for block in panel.block..panel.block + panel.vecs {
-                        filters.extend((0..ROWS).map(|row| tile_row(weights, tap, pair * PAIR + 2 * row, block, low)));
+        let mut filters = vec![ZERO; 9 * pairs * parts * ROWS * weights.outputs.div_ceil(LANES)];
+        for &Panel { block: first, vecs } in &panels {
+            let panel = 9 * pairs * parts * first;
+            for (block, c) in (first..first + vecs).flat_map(|block| (0..pairs * ROWS).map(move |c| (block, 2 * c))) {
+                let [even, odd] = [c, c + 1].map(|c| weights.block(block, c));
+                for tap in 0..9 {
+                    let tile = panel + (tap * pairs + c / PAIR) * parts * vecs + block - first;
+                    for (part, &low) in low.iter().enumerate() {
+                        let row = (tile + part * vecs) * ROWS + c % PAIR / 2;
+                        filters[row] = in_pairs(&even[tap], &odd[tap], low);
                     }
                 }
             }
@@ -90,15 +95,13 @@ impl Amx {
     }
 }
 
-/// 16 outputs of a block for input channels `c` and `c + 1`.
-fn tile_row(weights: &Weights<'_>, tap: usize, c: usize, block: usize, low: bool) -> Pixel {
-    let part = |k: usize, c: usize| {
-        let o = block * LANES + k;
-        let w = if o < weights.outputs && c < weights.inputs { weights.at(o, c, tap) } else { 0.0 };
-        let high = to_bf16(w);
-        u32::from(if low { to_bf16(w - from_bf16(high)) } else { high })
+/// Numbers of two channels side by side in bf16, or what rounding takes away from them.
+fn in_pairs(even: &Pixel, odd: &Pixel, low: bool) -> Pixel {
+    let part = |x: f32| {
+        let high = to_bf16(x);
+        u32::from(if low { to_bf16(x - from_bf16(high)) } else { high })
     };
-    Pixel(std::array::from_fn(|k| f32::from_bits(part(k, c) | part(k, c + 1) << 16)))
+    Pixel(std::array::from_fn(|k| f32::from_bits(part(even.0[k]) | part(odd.0[k]) << 16)))
 }
 
 /// Shape of the tiles: 8 of 16 rows of 64 bytes.

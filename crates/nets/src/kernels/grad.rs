@@ -16,6 +16,10 @@ use std::sync::Mutex;
 /// Chunks of a batch: enough to occupy a few cores, few enough that their sums stay a small part of the memory traffic.
 const MAX_CHUNKS: usize = 8;
 
+/// The fewest output pixels of a chunk: a deep layer's sums are as much memory as its images. Strips of so many pixels together
+/// are worked on at once by the matrix unit.
+const CHUNK_PIXELS: usize = 1024;
+
 enum Plan {
     Winograd(winograd::GradPlan),
     Direct(direct::GradPlan),
@@ -68,35 +72,38 @@ pub(super) fn weight_grad(
     let each = strip_rows(out_w);
     let strips = out_h.div_ceil(each);
     let jobs = grads.len() * strips;
-    let chunks = jobs.min(MAX_CHUNKS);
+    let chunks = jobs.min(MAX_CHUNKS).min((grads.len() * out_h * out_w / CHUNK_PIXELS).max(1));
     let mut buffers = std::mem::take(&mut scratch.sums);
     buffers.resize_with(chunks.max(buffers.len()), Default::default);
     let sums: Vec<Mutex<&mut [Pixel]>> = buffers[..chunks].iter_mut().map(|b| Mutex::new(b.zeros(pixels))).collect();
     scratch.each(chunks, |chunk, slot| {
         let mut sums = sums[chunk].lock().expect("no other worker has this chunk");
         let (bias, weights) = sums.split_at_mut(blocks);
-        for job in chunk * jobs / chunks..(chunk + 1) * jobs / chunks {
+        let strip = |job: usize| {
             let (image, y) = (job / strips, job % strips * each);
-            let rows = each.min(out_h - y);
-            let strip = GradStrip {
+            GradStrip {
                 input: x[image].view().down(step.first_row(y)),
                 grad: grads[image].view().inner().down(y),
-                rows,
+                rows: each.min(out_h - y),
                 width: out_w,
-            };
-            // SAFETY: both images have the strip, a border and whole tiles; `isa` is available.
-            unsafe {
-                match &plan {
-                    Plan::Winograd(p) => {
-                        add_bias(bias, &strip);
-                        winograd::weight_grad(isa, p, weights, strip, slot);
-                    }
-                    Plan::Direct(p) => {
-                        add_bias(bias, &strip);
-                        direct::weight_grad(isa, p, weights, strip);
-                    }
-                    #[cfg(target_arch = "x86_64")]
-                    Plan::Half(p) => half::weight_grad(p, bias, weights, strip, slot),
+            }
+        };
+        let of_chunk: Vec<GradStrip> = (chunk * jobs / chunks..(chunk + 1) * jobs / chunks).map(strip).collect();
+        // SAFETY: both images have the strips, a border and whole tiles; `isa` is available.
+        unsafe {
+            match &plan {
+                Plan::Winograd(p) => of_chunk.iter().for_each(|strip| {
+                    add_bias(bias, strip);
+                    winograd::weight_grad(isa, p, weights, *strip, slot);
+                }),
+                Plan::Direct(p) => of_chunk.iter().for_each(|strip| {
+                    add_bias(bias, strip);
+                    direct::weight_grad(isa, p, weights, *strip);
+                }),
+                #[cfg(target_arch = "x86_64")]
+                Plan::Half(p) => {
+                    let together = (CHUNK_PIXELS / (each.min(out_h) * out_w)).max(1);
+                    of_chunk.chunks(together).for_each(|some| half::weight_grad(p, bias, weights, some, slot));
                 }
             }
         }

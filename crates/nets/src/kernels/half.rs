@@ -125,70 +125,87 @@ impl GradPlan {
     /// From the sums to `[Cout, Cin/groups, 3, 3]`.
     pub(super) fn finish(&self, shape: &Weights<'_>, sums: &[Pixel], result: &mut [f32]) {
         for (o, c) in (0..shape.outputs).flat_map(|o| (0..shape.inputs).map(move |c| (o, c))) {
+            let Some(first) = shape.index(o, c, 0) else { continue };
             let filters = (o / HALVES * self.blocks_in + c / HALVES) * 9;
             let tile = o % HALVES / LANES * 2 + c % HALVES / LANES;
-            for tap in 0..9 {
-                if let Some(at) = shape.index(o, c, tap) {
-                    result[at] = sums[(filters + tap) * SUMS + tile * LANES + o % LANES].0[c % LANES];
-                }
+            for (tap, sum) in result[first..first + 9].iter_mut().enumerate() {
+                *sum = sums[(filters + tap) * SUMS + tile * LANES + o % LANES].0[c % LANES];
             }
         }
     }
 }
 
-/// Adds a strip's share to the sums.
+/// A strip, cut into products.
+struct Products {
+    strip: GradStrip,
+    /// Whether a product is of two rows, not of 32 pixels of one.
+    two_rows: bool,
+    /// Products side by side.
+    across: usize,
+    count: usize,
+    /// Its first operand of the input, in cache lines.
+    first: usize,
+}
+
+impl Products {
+    fn new(strip: GradStrip, first: usize) -> Self {
+        let GradStrip { rows, width, .. } = strip;
+        let (two_rows, across) = (width <= LANES, width.div_ceil(HALVES));
+        let count = if two_rows { rows.div_ceil(2) } else { rows * across };
+        Self { strip, two_rows, across, count, first }
+    }
+
+    /// Operands of the input for one column of taps: those of the first row of taps, of the second two rows on.
+    fn inputs(&self) -> usize {
+        (self.strip.rows + 2) * self.across
+    }
+}
+
+/// Adds the share of some strips to the sums. These are read and written once for all strips, which for deep layers of small
+/// pictures is most of the work.
 ///
 /// # Safety
-/// [`amx::available`](super::amx::available); both images have the strip, and that of the input 34 pixels beyond its last row.
+/// [`amx::available`](super::amx::available); both images have the strips, and that of the input 34 pixels beyond its last row.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn weight_grad(
     plan: &GradPlan,
     bias: &mut [Pixel],
     sums: &mut [Pixel],
-    strip: GradStrip,
+    strips: &[GradStrip],
     slot: &mut Slot,
 ) {
-    let GradStrip { input, grad, rows, width } = strip;
-    let two_rows = width <= LANES;
-    let across = width.div_ceil(HALVES);
-    let products = if two_rows { rows.div_ceil(2) } else { rows * across };
+    // Cache lines of the input's operands for one column of taps.
+    let mut column = 0;
+    let cut = |&strip: &GradStrip| {
+        let products = Products::new(strip, column);
+        column += products.inputs() * OPERAND;
+        products
+    };
+    let strips: Vec<Products> = strips.iter().map(cut).collect();
+    let products: usize = strips.iter().map(|strip| strip.count).sum();
     slot.a.grow(plan.blocks_out * products * OPERAND * LANES);
     let of_grad: *mut Pixel = slot.a.as_mut_ptr().cast();
-    // Of one column of taps: the products of the first row of taps, of the second two rows on.
-    let column = (rows + 2) * across * OPERAND;
     slot.b.grow(3 * column * LANES);
     let of_input: *mut Pixel = slot.b.as_mut_ptr().cast();
     // SAFETY: the caller's contract; the buffers have what was asked for, `sums` and `bias` what the plan says.
     unsafe {
         for (block, bias) in bias.as_chunks_mut::<2>().0.iter_mut().enumerate() {
-            for product in 0..products {
-                let (y, x) = if two_rows { (2 * product, 0) } else { (product / across, product % across * HALVES) };
-                let from = grad.ptr.add(block * grad.block + y * grad.row + x * LANES);
-                let (second, left) = if two_rows {
-                    (grad.row, if y + 1 < rows { width } else { 0 })
-                } else {
-                    (LANES * LANES, (width - x).saturating_sub(LANES))
-                };
-                let counts = [LANES.min(width - x), LANES.min(left)];
-                transpose((from, second), counts, bias, of_grad.add((block * products + product) * OPERAND));
+            let mut to = of_grad.add(block * products * OPERAND);
+            for strip in &strips {
+                grad_operands(strip, block, bias, to);
+                to = to.add(strip.count * OPERAND);
             }
         }
         asm!("ldtilecfg [{}]", in(reg) &raw const TILES, options(nostack, readonly));
         for block_in in 0..plan.blocks_in {
-            for at in 0..(rows + 2) * across {
-                let (y, x) = (at / across, at % across * HALVES);
-                let from = input.ptr.add(block_in * input.block + y * input.row + x * LANES);
-                let second = if two_rows { input.row } else { LANES * LANES };
-                for dx in 0..3 {
-                    pairs((from.add(dx * LANES), second), of_input.add(dx * column + at * OPERAND));
-                }
+            for strip in &strips {
+                input_operands(strip, block_in, of_input.add(strip.first), column);
             }
             for block_out in 0..plan.blocks_out {
                 let sums = sums[(block_out * plan.blocks_in + block_in) * 9 * SUMS..].as_mut_ptr();
                 for tap in 0..9 {
                     let a = of_grad.add(block_out * products * OPERAND);
-                    let b = of_input.add(tap % 3 * column + tap / 3 * across * OPERAND);
-                    multiply(a, (b, if two_rows { 2 * OPERAND } else { OPERAND }), products, sums.add(tap * SUMS));
+                    multiply(a, of_input.add(tap % 3 * column), tap / 3, &strips, sums.add(tap * SUMS));
                 }
             }
         }
@@ -196,27 +213,68 @@ pub(super) unsafe fn weight_grad(
     }
 }
 
-/// `sums[o][i] += Σ a[o][p] b[p][i]` for 32 × 32 channels and 32 `count` pixels; `each` cache lines from one b to the next.
+/// The left operands of a strip: 32 channels of ∂y, which are added up in `bias` too.
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+unsafe fn grad_operands(products: &Products, block: usize, bias: &mut [Pixel; 2], to: *mut Pixel) {
+    let &Products { strip: GradStrip { grad, rows, width, .. }, two_rows, across, count, .. } = products;
+    for product in 0..count {
+        let (y, x) = if two_rows { (2 * product, 0) } else { (product / across, product % across * HALVES) };
+        let (second, left) = if two_rows {
+            (grad.row, if y + 1 < rows { width } else { 0 })
+        } else {
+            (LANES * LANES, (width - x).saturating_sub(LANES))
+        };
+        let counts = [LANES.min(width - x), LANES.min(left)];
+        // SAFETY: the caller's contract.
+        unsafe {
+            let from = grad.ptr.add(block * grad.block + y * grad.row + x * LANES);
+            transpose((from, second), counts, bias, to.add(product * OPERAND));
+        }
+    }
+}
+
+/// The right operands of a strip: 32 channels of x, for each column of taps, `column` cache lines apart.
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+unsafe fn input_operands(products: &Products, block: usize, to: *mut Pixel, column: usize) {
+    let &Products { strip: GradStrip { input, .. }, two_rows, across, .. } = products;
+    let second = if two_rows { input.row } else { LANES * LANES };
+    for at in 0..products.inputs() {
+        let (y, x) = (at / across, at % across * HALVES);
+        // SAFETY: the caller's contract.
+        unsafe {
+            let from = input.ptr.add(block * input.block + y * input.row + x * LANES);
+            for dx in 0..3 {
+                pairs((from.add(dx * LANES), second), to.add(dx * column + at * OPERAND));
+            }
+        }
+    }
+}
+
+/// `sums[o][i] += Σ a[o][p] b[p][i]` for 32 × 32 channels and the pixels of all strips, at one row of taps.
 #[inline]
-unsafe fn multiply(mut a: *const Pixel, (mut b, each): (*const Pixel, usize), count: usize, sums: *mut Pixel) {
+unsafe fn multiply(mut a: *const Pixel, b: *const Pixel, tap_row: usize, strips: &[Products], sums: *mut Pixel) {
     // SAFETY: the caller gives the memory; the tiles are configured.
     unsafe {
         asm!("tileloadd tmm0, [{c} + {t}*1]", "tileloadd tmm1, [{c} + {t}*1 + 1024]",
             "tileloadd tmm2, [{c} + {t}*1 + 2048]", "tileloadd tmm3, [{c} + {t}*1 + 3072]",
             c = in(reg) sums, t = in(reg) 64usize, options(nostack, readonly));
-        for _ in 0..count {
-            asm!(
-                "tileloadd tmm4, [{a} + {t}*1]",
-                "tileloadd tmm6, [{b} + {t}*1]",
-                "tileloadd tmm5, [{a} + {t}*1 + 1024]",
-                "tileloadd tmm7, [{b} + {t}*1 + 1024]",
-                "tdpbf16ps tmm0, tmm4, tmm6",
-                "tdpbf16ps tmm1, tmm4, tmm7",
-                "tdpbf16ps tmm2, tmm5, tmm6",
-                "tdpbf16ps tmm3, tmm5, tmm7",
-                a = in(reg) a, b = in(reg) b, t = in(reg) 64usize, options(nostack, readonly),
-            );
-            (a, b) = (a.add(OPERAND), b.add(each));
+        for strip in strips {
+            let mut b = b.add(strip.first + tap_row * strip.across * OPERAND);
+            let each = if strip.two_rows { 2 * OPERAND } else { OPERAND };
+            for _ in 0..strip.count {
+                asm!(
+                    "tileloadd tmm4, [{a} + {t}*1]",
+                    "tileloadd tmm6, [{b} + {t}*1]",
+                    "tileloadd tmm5, [{a} + {t}*1 + 1024]",
+                    "tileloadd tmm7, [{b} + {t}*1 + 1024]",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tdpbf16ps tmm1, tmm4, tmm7",
+                    "tdpbf16ps tmm2, tmm5, tmm6",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    a = in(reg) a, b = in(reg) b, t = in(reg) 64usize, options(nostack, readonly),
+                );
+                (a, b) = (a.add(OPERAND), b.add(each));
+            }
         }
         asm!("tilestored [{c} + {t}*1], tmm0", "tilestored [{c} + {t}*1 + 1024], tmm1",
             "tilestored [{c} + {t}*1 + 2048], tmm2", "tilestored [{c} + {t}*1 + 3072], tmm3",

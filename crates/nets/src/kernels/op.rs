@@ -484,7 +484,8 @@ fn numbers<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     }
 }
 
-fn with_numbers<R>(t: &Tensor, f: impl FnOnce(&[f32]) -> Result<R>) -> Result<R> {
+/// The numbers of an f32 tensor on the CPU, in order.
+pub(crate) fn with_numbers<R>(t: &Tensor, f: impl FnOnce(&[f32]) -> Result<R>) -> Result<R> {
     let t = t.contiguous()?;
     let (storage, layout) = t.storage_and_layout();
     match &*storage {
@@ -553,6 +554,6 @@ impl CustomOp2 for Chain {
         let (images, all) = with_numbers(params, back)?;
         let dx = self.wants_input_grad.then(|| planes(&images, dims(x)?)).transpose()?;
         IMAGES.give(images);
-        Ok((dx, params.track_op().then(|| Tensor::new(all, &Device::Cpu)).transpose()?))
+        Ok((dx, params.track_op().then(|| Tensor::from_vec(all, params.shape(), &Device::Cpu)).transpose()?))
     }
 }

@@ -7,6 +7,7 @@ use super::data::{TrainData, to_video};
 use super::iterates::{Call, Simulated};
 use super::noise::{add_noise, sensor};
 use super::unrolled::Unrolled;
+use crate::kernels::with_numbers;
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
 use admm::{DenoiseCx, Denoiser, Flips};
@@ -131,13 +132,29 @@ impl Gradients {
     }
 
     /// Adds `share` times another.
-    pub(super) fn add(&mut self, loss: f32, of_vars: Vec<Option<Vec<f32>>>, share: f32) {
-        self.loss += share * loss;
-        for (sum, gradient) in self.of_vars.iter_mut().zip(of_vars) {
+    fn add(&mut self, other: Self, share: f32) {
+        self.loss += share * other.loss;
+        for (sum, gradient) in self.of_vars.iter_mut().zip(other.of_vars) {
             let Some(gradient) = gradient else { continue };
             let sum = sum.get_or_insert_with(|| vec![0.0; gradient.len()]);
             sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * g);
         }
+    }
+
+    /// Adds a loss and what was found to be its gradient.
+    pub(super) fn add_found(&mut self, loss: f32, found: &GradStore, vars: &[(String, Var)]) -> Result<()> {
+        self.loss += loss;
+        for (sum, (_, var)) in self.of_vars.iter_mut().zip(vars) {
+            match (sum, found.get(var)) {
+                (_, None) => {}
+                (none @ None, Some(gradient)) => *none = Some(gradient.flatten_all()?.to_vec1()?),
+                (Some(sum), Some(gradient)) => with_numbers(gradient, |gradient| {
+                    sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += g);
+                    Ok(())
+                })?,
+            }
+        }
+        Ok(())
     }
 }
 
@@ -347,7 +364,7 @@ impl Trainer {
         let parts = lessons.par_iter().map(|lesson| self.gradient(lesson)).collect::<Result<Vec<_>>>()?;
         let mut mean = Gradients::zero(self.vars.len());
         let share = 1.0 / lessons.len() as f32;
-        parts.into_iter().for_each(|part| mean.add(part.loss, part.of_vars, share));
+        parts.into_iter().for_each(|part| mean.add(part, share));
         Ok(mean)
     }
 
@@ -357,8 +374,9 @@ impl Trainer {
             Lesson::Unrolled(unrolled) => unrolled.gradient(network, &self.vars, loss),
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
                 let loss = loss.mean(&(network.forward(seen, sigmas)? - clean)?)?;
-                let of_vars = gradients_of(&loss.backward()?, &self.vars)?;
-                Ok(Gradients { loss: loss.to_scalar()?, of_vars })
+                let mut found = Gradients::zero(self.vars.len());
+                found.add_found(loss.to_scalar()?, &loss.backward()?, &self.vars)?;
+                Ok(found)
             }
         }
     }
@@ -512,12 +530,6 @@ impl Trainer {
         self.step = meta.step;
         Ok(())
     }
-}
-
-/// The gradient for each of `vars`, as plain numbers.
-pub(super) fn gradients_of(store: &GradStore, vars: &[(String, Var)]) -> Result<Vec<Option<Vec<f32>>>> {
-    let plain = |(_, var): &(String, Var)| store.get(var).map(|g| g.flatten_all()?.to_vec1()).transpose();
-    Ok(vars.iter().map(plain).collect::<candle_core::Result<_>>()?)
 }
 
 fn values(var: &Var) -> Result<Vec<f32>> {

@@ -6,7 +6,7 @@
 
 use super::config::Loss;
 use super::iterates::{Call, Simulated};
-use super::step::{Gradients, gradients_of, tensor};
+use super::step::{Gradients, tensor};
 use crate::{Error, Network, Result};
 use admm::flipped_axes;
 use candle_core::{Tensor, Var};
@@ -43,7 +43,7 @@ impl Unrolled {
                 }
             };
             let gradients = objective.backward()?;
-            total.add(own.to_scalar()?, gradients_of(&gradients, vars)?, 1.0);
+            total.add_found(own.to_scalar()?, &gradients, vars)?;
             share *= 0.5;
             if let Some(to_input) = gradients.get(&input) {
                 let to_input = Array4::from_shape_vec(input.dims4()?, to_input.flatten_all()?.to_vec1()?);
