@@ -73,15 +73,31 @@ fn tv_goes_first_only_once() {
     assert!(iterations_of_tv("solver={kind=\"gap\",start=\"mean\"}") > 0);
 }
 
+/// A network that was trained for the σ of its schedule is given all of them, until the run stops.
+#[test]
+fn the_sigmas_of_a_network_for_iterates_are_not_passed_over() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
+    // Far above what is left of the error after the start.
+    let stages = "stage=[{sigma=100,iterations=1},{sigma=50,iterations=1},{sigma=7,iterations=1}]";
+    run(&bench, &bench.path("default.toml"), "out", &[stages, "skip.enabled=true"]);
+    let sigmas = bench.record("out")["measurements"][0]["trace"]["sigma"].as_array().unwrap().len();
+    assert_eq!(sigmas, 3);
+}
+
 #[test]
 fn what_the_default_cannot_do_with_its_network_is_refused() {
     let bench = Bench::new();
     std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
-    let holes = ["bundled:fastdvdnet_gray_sci", "bundled:fastdvdnet_gray\"", "skip.enabled = false"];
+    let auto = ["skip.enabled=true", "stage=[{sigma=\"auto\",iterations=4}]"];
+    let trained = ["stage.0.sigma", "\"auto\"", "trained for the σ of its schedule"];
     let flips = ["[online]", "denoiser.flips = false", "online.enabled = false"];
-    for (set, parts) in [("skip.enabled=true", holes), ("online.enabled=true", flips)] {
-        let refused =
-            bench.finish(bench.command(&["run", "--out", "out", "--set", set]).arg(bench.path("default.toml")));
+    for (sets, parts) in [(&auto[..], trained), (&["online.enabled=true"], flips)] {
+        let mut command = bench.command(&["run", "--out", "out"]);
+        sets.iter().for_each(|set| {
+            command.args(["--set", set]);
+        });
+        let refused = bench.finish(command.arg(bench.path("default.toml")));
         assert_eq!(refused.code, 2, "{}", refused.stderr);
         for part in parts {
             assert!(refused.stderr.contains(part), "{}", refused.stderr);

@@ -23,7 +23,7 @@ pub fn bundled_names() -> Vec<&'static str> {
 }
 
 /// Whether a path is that of bundled weights for the iterates of a solver, whose names end in `_sci`. They are no denoisers of
-/// white noise, and know iterates of complete measurements only.
+/// white noise, and know the σ of their schedule only.
 pub fn bundled_for_iterates(path: &str) -> bool {
     path.strip_prefix("bundled:").is_some_and(|name| name.ends_with("_sci"))
 }

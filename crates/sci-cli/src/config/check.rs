@@ -265,10 +265,10 @@ impl<'s> Checker<'s> {
         let missing = |key: &str| self.source.file_error(format!("no [{key}] table"));
         let data = self.data(data.ok_or_else(|| missing("data"))?, seed)?;
         let (solver, start, demosaicer) = self.solver(solver.ok_or_else(|| missing("solver"))?)?;
-        let skip = self.skip(skip, seed)?;
+        let mut skip = self.skip(skip, seed)?;
         let (denoisers, stages) = self.schedule(&top.schedule, denoiser, stages, named, skip.is_some())?;
-        if skip.is_some() {
-            self.networks_suit(&denoisers)?;
+        if let Some(skip) = &mut skip {
+            skip.keep_trained_sigmas(&denoisers);
         }
         let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
@@ -556,6 +556,12 @@ impl<'s> Checker<'s> {
                 Some(sigma) if !skips => {
                     let problem =
                         format!("`{key}.sigma` = \"auto\" is decided by held-out pixels: it needs skip.enabled = true");
+                    return Err(self.source.error(&sigma.span(), problem));
+                }
+                Some(sigma) if denoisers[denoiser].for_iterates() => {
+                    let problem = format!(
+                        "`{key}.sigma` = \"auto\" is for networks of any σ; this one was trained for the σ of its schedule"
+                    );
                     return Err(self.source.error(&sigma.span(), problem));
                 }
                 Some(_) => Some(AUTO[0]),

@@ -2,6 +2,7 @@
 
 use nets::Ends;
 use nets::kernels::Precision;
+use nets::weights::bundled_for_iterates;
 
 use super::check::{Checker, PathSetting};
 use super::file::{NetKeys, Section, TvKeys, Value, VideoNetKeys};
@@ -51,6 +52,11 @@ impl Denoiser {
             Self::Tv { .. } => None,
             Self::Ffdnet { weights, .. } | Self::Fastdvdnet { weights, .. } => Some(weights),
         }
+    }
+
+    /// Whether it is a network that was trained for the iterates of one schedule.
+    pub fn for_iterates(&self) -> bool {
+        self.weights().is_some_and(|weights| bundled_for_iterates(&weights.text))
     }
 
     /// Whether it sees the video another way round in every iteration.
