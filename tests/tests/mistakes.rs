@@ -148,9 +148,9 @@ fn not_toml() {
 fn what_is_not_there_yet_is_refused() {
     fails(
         &bench(),
-        &["--set", "denoiser.kind=wnnm"],
+        &["--set", "denoiser.kind=wavelet"],
         2,
-        &["--set denoiser.kind=wnnm", "`denoiser.kind` = wnnm", "not available yet"],
+        &["--set denoiser.kind=wavelet", "`denoiser.kind` = wavelet", "not available yet"],
     );
 }
 

@@ -1,5 +1,5 @@
 //! Plug-and-play solvers for snapshot compressive imaging: one loop ([`run`]), solvers that take any [`Denoiser`]
-//! ([`Gap`], [`Admm`], [`TwoStage`] for color sensors), and priors that need no network ([`Tv`]).
+//! ([`Gap`], [`Admm`], [`TwoStage`] for color sensors), and priors that need no network ([`Tv`], [`Wnnm`]).
 //!
 //! A solver never sees ground truth, files, networks or the clock; observers and the stop rule do.
 //!
@@ -37,6 +37,7 @@ mod still;
 mod tiles;
 mod tv;
 mod two_stage;
+mod wnnm;
 
 pub use admm::Admm;
 pub use color::{Demosaicked, PerLattice};
@@ -53,3 +54,4 @@ pub use still::still;
 pub use tiles::{TileConfig, TileCounts, Tiles};
 pub use tv::Tv;
 pub use two_stage::{Convention, TwoStage, TwoStageParams, XStep};
+pub use wnnm::Wnnm;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use admm::{
     Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, MomentumStart, Observer, Outcome, PerLattice,
-    PerStage, Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage,
+    PerStage, Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage, Wnnm,
 };
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
@@ -42,6 +42,8 @@ struct Sensor {
 enum Part {
     /// Built anew for each measurement, as it may carry state from call to call.
     Tv { weight: f32, inner: usize },
+    /// The same for all.
+    Wnnm(Wnnm),
     /// Loaded once. Without a measurement it is the network itself.
     Ffdnet(AdaptiveDenoiser<nets::Ffdnet>, Inference),
     /// Loaded once.
@@ -51,7 +53,7 @@ enum Part {
 impl Part {
     fn prepare(&mut self, task: &Task) -> online::Result<()> {
         match self {
-            Self::Tv { .. } => Ok(()),
+            Self::Tv { .. } | Self::Wnnm(_) => Ok(()),
             Self::Ffdnet(net, _) => task.prepare(net),
             Self::Fastdvdnet(net, _) => task.prepare(net),
         }
@@ -59,7 +61,7 @@ impl Part {
 
     fn updates(&self) -> &[Update] {
         match self {
-            Self::Tv { .. } => &[],
+            Self::Tv { .. } | Self::Wnnm(_) => &[],
             Self::Ffdnet(net, _) => net.updates(),
             Self::Fastdvdnet(net, _) => net.updates(),
         }
@@ -195,7 +197,7 @@ impl<'e> Factory<'e> {
         for (i, (part, choice)) in self.parts.iter().zip(&self.experiment.denoisers).enumerate() {
             let path = dir.join(format!("adapted-{i}-{}.safetensors", choice.kind()));
             match part {
-                Part::Tv { .. } => {}
+                Part::Tv { .. } | Part::Wnnm(_) => {}
                 Part::Ffdnet(net, _) => net.save(&path)?,
                 Part::Fastdvdnet(net, _) => net.save(&path)?,
             }
@@ -232,17 +234,18 @@ fn denoiser<'p>(
 ) -> PerStage<'p> {
     let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
     let denoisers = parts.iter_mut().map(|part| {
-        let network = match part {
+        let on_frames = match part {
             Part::Tv { weight, inner } => {
                 let tv = Tv::new(*weight).inner(*inner);
                 return if on_mosaic.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) };
             }
+            Part::Wnnm(wnnm) => saving.spare_tiles(*wnnm),
             Part::Ffdnet(net, inference) => saving.spare(net, *inference),
             Part::Fastdvdnet(net, inference) => saving.spare(net, *inference),
         };
         match on_mosaic {
-            None => network,
-            Some(s) => boxed(Demosaicked::new(network, s.demosaicer.clone(), s.cfa)),
+            None => on_frames,
+            Some(s) => boxed(Demosaicked::new(on_frames, s.demosaicer.clone(), s.cfa)),
         }
     });
     PerStage::new(denoisers.collect(), experiment.stages.iter().map(|s| s.denoiser).collect())
@@ -339,6 +342,7 @@ fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>
     };
     Ok(match choice {
         DenoiserChoice::Tv { weight, inner } => Part::Tv { weight: *weight, inner: *inner },
+        DenoiserChoice::Wnnm(wnnm) => Part::Wnnm(*wnnm),
         DenoiserChoice::Ffdnet { weights, inference } => {
             let mut net = nets::Ffdnet::load(weights).context("denoiser.weights")?;
             fits(&net, weights)?;

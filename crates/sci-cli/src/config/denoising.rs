@@ -1,11 +1,12 @@
 //! Owns the rules of `[denoiser]`.
 
+use admm::Wnnm;
 use nets::Ends;
 use nets::kernels::Precision;
 use nets::weights::bundled_for_iterates;
 
 use super::check::{Checker, PathSetting};
-use super::file::{NetKeys, Section, TvKeys, Value, VideoNetKeys};
+use super::file::{NetKeys, Section, TvKeys, Value, VideoNetKeys, WnnmKeys};
 use super::source::ConfigError;
 
 /// How a network is run.
@@ -27,6 +28,8 @@ pub enum Denoiser {
         /// Dual steps a call.
         inner: usize,
     },
+    /// Weighted nuclear norm minimisation.
+    Wnnm(Wnnm),
     /// FFDNet.
     Ffdnet {
         /// Weight file.
@@ -49,7 +52,7 @@ impl Denoiser {
     /// The weight file of a network.
     pub fn weights(&self) -> Option<&PathSetting> {
         match self {
-            Self::Tv { .. } => None,
+            Self::Tv { .. } | Self::Wnnm(_) => None,
             Self::Ffdnet { weights, .. } | Self::Fastdvdnet { weights, .. } => Some(weights),
         }
     }
@@ -62,7 +65,7 @@ impl Denoiser {
     /// Whether it sees the video another way round in every iteration.
     pub fn flips(&self) -> bool {
         match self {
-            Self::Tv { .. } => false,
+            Self::Tv { .. } | Self::Wnnm(_) => false,
             Self::Ffdnet { inference, .. } | Self::Fastdvdnet { inference, .. } => inference.flips,
         }
     }
@@ -93,6 +96,20 @@ impl<'s> Checker<'s> {
                     inner: self.whole(&format!("{key}.inner"), &k.inner, 1..=1000)?.unwrap_or(5) as usize,
                 })
             }
+            "wnnm" => {
+                let k: WnnmKeys = section.read(&["kind"])?;
+                let default = Wnnm::default();
+                let whole = |name: &str, value, range, default: usize| {
+                    Ok(self.whole(&format!("{key}.{name}"), value, range)?.map_or(default, |n| n as usize))
+                };
+                Ok(Denoiser::Wnnm(Wnnm {
+                    patch: whole("patch", &k.patch, 2..=16, default.patch)?,
+                    group: whole("group", &k.group, 2..=256, default.group)?,
+                    step: whole("step", &k.step, 1..=16, default.step)?,
+                    window: whole("window", &k.window, 1..=64, default.window)?,
+                    frames: whole("frames", &k.frames, 0..=64, default.frames)?,
+                }))
+            }
             "ffdnet" => {
                 let k: NetKeys = section.read(&["kind"])?;
                 Ok(Denoiser::Ffdnet {
@@ -109,7 +126,7 @@ impl<'s> Checker<'s> {
                     weights: self.path(&format!("{key}.weights"), k.weights, &span)?,
                 })
             }
-            _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, ffdnet, fastdvdnet")),
+            _ => Err(self.not_yet(&format!("{key}.kind"), &kind.span(), "tv, wnnm, ffdnet, fastdvdnet")),
         }
     }
 }

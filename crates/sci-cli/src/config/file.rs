@@ -129,6 +129,18 @@ pub struct TvKeys {
     pub inner: Value,
 }
 
+/// `[denoiser]`, `kind = "wnnm"`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct WnnmKeys {
+    pub patch: Value,
+    pub group: Value,
+    pub step: Value,
+    pub window: Value,
+    pub frames: Value,
+}
+
 /// `[denoiser]`, `kind = "ffdnet"`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

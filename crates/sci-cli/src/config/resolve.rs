@@ -3,7 +3,7 @@
 use std::env;
 use std::path::{Path, PathBuf};
 
-use admm::{Convention, HoldOut, XStep};
+use admm::{Convention, HoldOut, Wnnm, XStep};
 use nets::Ends;
 use serde_json::{Value, json};
 
@@ -69,6 +69,8 @@ pub enum Denoiser {
         /// Dual steps a call.
         inner: usize,
     },
+    /// Weighted nuclear norm minimisation.
+    Wnnm(Wnnm),
     /// FFDNet.
     Ffdnet {
         /// Weight file, absolute.
@@ -92,6 +94,7 @@ impl Denoiser {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Tv { .. } => "tv",
+            Self::Wnnm(_) => "wnnm",
             Self::Ffdnet { .. } => "ffdnet",
             Self::Fastdvdnet { .. } => "fastdvdnet",
         }
@@ -182,6 +185,7 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         .iter()
         .map(|d| match d {
             denoising::Denoiser::Tv { weight, inner } => Ok(Denoiser::Tv { weight: *weight, inner: *inner }),
+            denoising::Denoiser::Wnnm(wnnm) => Ok(Denoiser::Wnnm(*wnnm)),
             denoising::Denoiser::Ffdnet { weights, inference } => {
                 Ok(Denoiser::Ffdnet { weights: locate_weights(weights, source)?, inference: *inference })
             }
@@ -454,6 +458,9 @@ fn denoiser_json(d: &Denoiser) -> Value {
     match d {
         Denoiser::Tv { weight, inner } => {
             json!({ "kind": "tv", "weight": weight, "inner": inner })
+        }
+        Denoiser::Wnnm(Wnnm { patch, group, step, window, frames }) => {
+            json!({ "kind": "wnnm", "patch": patch, "group": group, "step": step, "window": window, "frames": frames })
         }
         Denoiser::Ffdnet { weights, inference: Inference { precision, flips } } => {
             json!({ "kind": "ffdnet", "weights": weights, "precision": precision, "flips": flips })
