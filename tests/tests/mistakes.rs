@@ -155,6 +155,16 @@ fn what_is_not_there_yet_is_refused() {
 }
 
 #[test]
+fn settings_of_wnnm_are_checked() {
+    for (denoiser, needles) in [
+        ("denoiser={kind=\"wnnm\",patch=1}", ["`denoiser.patch` = 1", "2 to 16"]),
+        ("denoiser={kind=\"wnnm\",weight=0.1}", ["weight", "window"]),
+    ] {
+        fails(&bench(), &["--set", denoiser], 2, &needles);
+    }
+}
+
+#[test]
 fn settings_of_skipping_are_checked() {
     for (argument, needles) in [
         ("skip.enabled=maybe", ["`skip.enabled` = maybe", "true"]),
