@@ -108,10 +108,9 @@ impl Matcher {
         let mut sums = [0f32; COLUMNS];
         for i in 0..side {
             let own = &row(reference, i)[..side];
-            let other = &row(first, i)[..(side + COLUMNS - 1).min(row(first, i).len())];
+            let other = &row(first, i)[..side + COLUMNS - 1];
             for (j, &own) in own.iter().enumerate() {
-                let Some(other) = other.get(j..j + COLUMNS) else { continue };
-                for (sum, &other) in sums.iter_mut().zip(other) {
+                for (sum, &other) in sums.iter_mut().zip(&other[j..j + COLUMNS]) {
                     *sum += (other - own) * (other - own);
                 }
             }

@@ -125,10 +125,10 @@ impl Shrunk {
         let of_groups: Vec<Vec<Place>> = references.iter().map(|&reference| matcher.like(reference)).collect();
         let shrink = |plane: &ArrayView3<'_, f32>| {
             let mut shrinker = Shrinker::new(side * side, sigma);
-            for (lane, group) in of_groups.iter().enumerate() {
+            for group in &of_groups {
                 let patch =
                     |place: &Place, k: usize| plane[[place.frame, place.row + k / side, place.column + k % side]];
-                shrinker.take(lane, group.len(), |m, k| patch(&group[m], k));
+                shrinker.take(group.len(), |m, k| patch(&group[m], k));
             }
             shrinker.shrunk()
         };

@@ -74,8 +74,7 @@ impl Shrinker {
     }
 
     /// The next group: `pixel(m, k)` is pixel `k` of patch `m`.
-    pub(super) fn take(&mut self, lane: usize, count: usize, pixel: impl Fn(usize, usize) -> f32) {
-        debug_assert_eq!(lane, self.groups.len());
+    pub(super) fn take(&mut self, count: usize, pixel: impl Fn(usize, usize) -> f32) {
         let padded = count.next_multiple_of(GROUPS);
         let mut rest = vec![0.0; self.pixels * padded];
         let mut mean = vec![0.0; self.pixels];
@@ -84,7 +83,7 @@ impl Shrinker {
             *mean = row[..count].iter().sum::<f32>() / count as f32;
             row[..count].iter_mut().for_each(|value| *value = (*value - *mean) / self.sigma);
         }
-        gram_of(&rest, padded, lane, &mut self.gram);
+        gram_of(&rest, padded, self.groups.len(), &mut self.gram);
         self.groups.push(Group { count, padded, mean, rest });
     }
 
@@ -253,7 +252,7 @@ mod tests {
         assert!(shrunk[1] > 0.0 && shrunk[2] == 0.0);
         let mut shrinker = Shrinker::new(pixels, sigma);
         for lane in 0..3 {
-            shrinker.take(lane, count, |m, k| matrix(singular, m, k) as f32 + lane as f32);
+            shrinker.take(count, |m, k| matrix(singular, m, k) as f32 + lane as f32);
         }
         let found = shrinker.shrunk();
         assert_eq!(found.len(), 3 * count * pixels);
@@ -268,7 +267,7 @@ mod tests {
     fn noise_leaves_the_mean_patch() {
         let noise = gaussian((48, 36), 3);
         let mut shrinker = Shrinker::new(36, 1.0);
-        shrinker.take(0, 48, |m, k| noise[[m, k]]);
+        shrinker.take(48, |m, k| noise[[m, k]]);
         let energy = shrinker.shrunk().iter().map(|v| v * v).sum::<f32>() / (48.0 * 36.0);
         assert!(energy < 0.1, "{energy}");
     }
