@@ -53,6 +53,7 @@ fn training(c: &mut Criterion) {
             warmup: 0,
             average: 0.999,
             clip_norm: 1.0,
+            revive: 100,
         },
         validation: ValidationConfig::default(),
         checkpoint: CheckpointConfig::default(),

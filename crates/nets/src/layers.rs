@@ -3,10 +3,12 @@
 use crate::kernels::{Conv3x3, Link, Precision, conv_chain};
 use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
+use candle_nn::ops::pixel_shuffle;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::{Arc, OnceLock};
 
 /// PyTorch's default, which all published weights were trained with.
 const BATCH_NORM_EPSILON: f64 = 1e-5;
@@ -48,6 +50,8 @@ pub struct Conv {
     weight: Tensor,
     bias: Option<Tensor>,
     norm: Option<BatchNorm>,
+    /// Set in a layer that is watched: the means of what it was given.
+    input_means: Option<Arc<OnceLock<Vec<f32>>>>,
 }
 
 /// What a [`Conv`] adds to its products.
@@ -86,7 +90,7 @@ impl Conv {
             }),
             _ => None,
         };
-        Ok(Self { name, opts, inference: Precision::F32, weight, bias, norm })
+        Ok(Self { name, opts, inference: Precision::F32, weight, bias, norm, input_means: None })
     }
 
     /// How inference does the layer.
@@ -102,6 +106,16 @@ impl Conv {
     /// What the differentiable layer multiplies.
     pub(crate) fn set_precision(&mut self, precision: Precision) {
         self.opts.precision = precision;
+    }
+
+    /// Lets the next differentiable pass, which becomes slower, note the means of what the layer is given.
+    pub(crate) fn watch(&mut self) {
+        self.input_means = Some(Arc::default());
+    }
+
+    /// The mean of each channel that the layer was given since [`Conv::watch`], over all images and pixels.
+    pub(crate) fn input_means(&self) -> Option<&[f32]> {
+        Some(self.input_means.as_ref()?.get()?)
     }
 
     pub(crate) fn device(&self) -> &Device {
@@ -131,11 +145,20 @@ impl Conv {
         Ok(())
     }
 
+    pub(crate) fn weight_name(&self) -> String {
+        format!("{}.weight", self.name)
+    }
+
+    pub(crate) fn bias_name(&self) -> String {
+        format!("{}.bias", self.name)
+    }
+
     /// `(name, tensor, trainable)` of everything in the layer.
     pub(crate) fn tensors_mut(&mut self) -> Vec<(String, &mut Tensor, bool)> {
-        let mut all = vec![(format!("{}.weight", self.name), &mut self.weight, true)];
+        let (weight_name, bias_name) = (self.weight_name(), self.bias_name());
+        let mut all = vec![(weight_name, &mut self.weight, true)];
         if let Some(bias) = &mut self.bias {
-            all.push((format!("{}.bias", self.name), bias, true));
+            all.push((bias_name, bias, true));
         }
         if let Some(norm) = &mut self.norm {
             let name = |key| format!("{}.{key}", norm.name);
@@ -176,7 +199,31 @@ pub(crate) fn chain(convs: &[Conv], ways: &[(usize, usize)], x: &Tensor) -> cand
         let onto = ways.iter().find(|(layer, _)| *layer == i).map(|(_, earlier)| *earlier);
         Ok(Link { onto, ..Link::new(weight, bias, conv.opts) })
     };
-    conv_chain(x, &convs.iter().enumerate().map(link).collect::<candle_core::Result<Vec<_>>>()?)
+    let links = convs.iter().enumerate().map(link).collect::<candle_core::Result<Vec<_>>>()?;
+    if convs.iter().all(|conv| conv.input_means.is_none()) {
+        return conv_chain(x, &links);
+    }
+    let means: Vec<_> = convs.iter().map(|conv| conv.input_means.as_deref()).collect();
+    watched(&links, &means, x)
+}
+
+/// As [`conv_chain`], layer by layer; the means of what goes into each go to `means`.
+fn watched(links: &[Link], means: &[Option<&OnceLock<Vec<f32>>>], x: &Tensor) -> candle_core::Result<Tensor> {
+    let mut results: Vec<Tensor> = Vec::new();
+    for (link, means) in links.iter().zip(means) {
+        let input = results.last().unwrap_or(x);
+        if let Some(means) = means {
+            let of_channels = input.transpose(0, 1)?.flatten_from(1)?.mean(1)?.to_vec1()?;
+            // A second pass finds the first one's.
+            let _ = means.set(of_channels);
+        }
+        let y = conv_chain(input, &[Link { onto: None, ..link.clone() }])?;
+        results.push(match link.onto {
+            None => y,
+            Some(earlier) => (&results[earlier] + pixel_shuffle(&y, 2)?)?,
+        });
+    }
+    Ok(results.pop().unwrap_or_else(|| x.clone()))
 }
 
 /// How a tensor starts when it is not loaded.

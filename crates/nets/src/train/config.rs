@@ -155,6 +155,10 @@ pub struct TrainingConfig {
     /// Longest gradient (Euclidean norm over all weights); longer ones are shortened to it. Above 0; default 1.
     #[serde(default = "unit")]
     pub clip_norm: f64,
+    /// Steps in a row without a gradient after which a channel begins anew, in the first three quarters of all steps; 0 leaves such
+    /// channels shut. Default 100.
+    #[serde(default = "hundred")]
+    pub revive: u32,
 }
 
 /// Training on the iterates of accelerated GAP: each clip is measured through new random masks, and solved with the network as
@@ -264,6 +268,9 @@ fn two() -> usize {
 }
 fn average() -> f64 {
     0.999
+}
+fn hundred() -> u32 {
+    100
 }
 fn unit() -> f64 {
     1.0

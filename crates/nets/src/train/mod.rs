@@ -9,6 +9,7 @@ mod data;
 mod iterates;
 mod muon;
 mod noise;
+mod revive;
 mod step;
 mod unrolled;
 

@@ -1,13 +1,15 @@
 //! The training loop's body.
 
-use super::adam::Adam;
+use super::adam::{Adam, Centre};
 use super::checkpoint::{self, Meta};
-use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig};
+use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
 use super::iterates::{Call, Simulated};
 use super::noise::{add_noise, sensor};
+use super::revive::{Idle, State};
 use super::unrolled::Unrolled;
 use crate::kernels::with_numbers;
+use crate::layers::Conv;
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
 use admm::{DenoiseCx, Denoiser, Flips};
@@ -32,6 +34,8 @@ pub struct StepReport {
     pub learning_rate: f64,
     /// Norm of the gradient before it was shortened.
     pub gradient_norm: f64,
+    /// Channels that began anew after it, because a ReLU had shut them for every input for a long time.
+    pub revived: usize,
 }
 
 /// Mean PSNR over the frames of all validation clips.
@@ -185,6 +189,7 @@ pub struct Trainer {
     vars: Vec<(String, Var)>,
     adam: Adam,
     average: Vec<Vec<f32>>,
+    idle: Idle,
     step: u64,
 }
 
@@ -193,6 +198,9 @@ impl std::fmt::Debug for Trainer {
         f.debug_struct("Trainer").field("config", &self.config).field("step", &self.step).finish_non_exhaustive()
     }
 }
+
+/// Steps between measurements of what the layers are given on average.
+const CENTRE_EVERY: u64 = 20;
 
 /// Streams of the generator: the steps take the ones from 0.
 const VALIDATION_STREAM: u64 = 1 << 63;
@@ -234,7 +242,8 @@ impl Trainer {
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
-        Ok(Self { config, data, model, vars, adam, average, step: 0 })
+        let idle = Idle::new(&model.network().convs(), &vars);
+        Ok(Self { config, data, model, vars, adam, average, idle, step: 0 })
     }
 
     /// Begins with these weights instead of random ones.
@@ -345,6 +354,9 @@ impl Trainer {
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
+        if self.config.training.optimizer == Optimizer::Muon && self.step.is_multiple_of(CENTRE_EVERY) {
+            self.find_centres(&lessons[0])?;
+        }
         let Gradients { loss, of_vars } = self.gradients(&lessons)?;
         let diverged = Error::Diverged { step: self.step + 1, loss };
         if !loss.is_finite() {
@@ -355,8 +367,39 @@ impl Trainer {
             return Err(diverged);
         }
         self.update_average()?;
+        self.idle.count(&of_vars);
+        let revived = self.revive(&mut rng)?;
         self.step += 1;
-        Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm })
+        Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm, revived })
+    }
+
+    /// What each layer is given on average, from what a lesson begins with.
+    fn find_centres(&mut self, lesson: &Lesson) -> Result<()> {
+        let mut watched = self.model.clone();
+        watched.network_mut().convs_mut().into_iter().for_each(Conv::watch);
+        match lesson {
+            Lesson::Batch(Batch { seen, sigmas, .. }) => watched.network().forward(seen, sigmas)?,
+            Lesson::Unrolled(unrolled) => {
+                let first = &unrolled.calls[0];
+                watched.network().forward(&tensor(first.input.clone())?, &[first.sigma])?
+            }
+        };
+        for (conv, (weight, bias)) in watched.network().convs().into_iter().zip(self.idle.layers()) {
+            if let (Some(bias), Some(means)) = (bias, conv.input_means()) {
+                self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
+            }
+        }
+        Ok(())
+    }
+
+    /// Lets channels that were idle for long begin anew, while there is time for them to learn.
+    fn revive(&mut self, rng: &mut ChaCha8Rng) -> Result<usize> {
+        let TrainingConfig { revive, steps, .. } = self.config.training;
+        if revive == 0 || self.step >= steps / 4 * 3 {
+            return Ok(0);
+        }
+        let state = State { vars: &self.vars, average: &mut self.average, adam: &mut self.adam };
+        self.idle.revive(revive, state, rng)
     }
 
     /// The mean loss of the lessons, and its gradient.
@@ -485,6 +528,12 @@ impl Trainer {
             tensors.insert(format!("first/{name}"), m);
             tensors.insert(format!("second/{name}"), v);
         }
+        for (weight, counts) in self.idle.counts() {
+            tensors.insert(format!("idle/{}", self.vars[weight].0), Tensor::new(counts, &Device::Cpu)?);
+        }
+        for (weight, Centre { means, .. }) in self.adam.centres() {
+            tensors.insert(format!("means/{}", self.vars[weight].0), Tensor::new(&**means, &Device::Cpu)?);
+        }
         checkpoint::write(path, &Meta::new(self.step, self.adam.steps(), self.config.clone()), &tensors)
     }
 
@@ -509,24 +558,34 @@ impl Trainer {
 
     fn restore(&mut self, path: &Path, (meta, mut tensors): (Meta, BTreeMap<String, Tensor>)) -> Result<()> {
         checkpoint::check_same_run(path, &meta.config, &self.config)?;
-        let mut take = |kind: &str, name: &str, var: &Var| -> Result<Vec<f32>> {
+        let mut take = |kind: &str, name: &str, shape: &[usize]| -> Result<Vec<f32>> {
             let key = format!("{kind}/{name}");
-            let tensor = tensors.remove(&key).filter(|t| t.shape() == var.shape());
+            let tensor = tensors.remove(&key).filter(|t| t.dims() == shape);
             let tensor = tensor.ok_or_else(|| Error::format(path, format!("{key} is missing or of another shape")))?;
             Ok(tensor.flatten_all()?.to_vec1()?)
         };
         let (mut weights, mut averages, mut moments) = (Vec::new(), Vec::new(), Vec::new());
         for (name, var) in &self.vars {
-            weights.push(take("weights", name, var)?);
-            averages.push(take("average", name, var)?);
-            moments.push((take("first", name, var)?, take("second", name, var)?));
+            let shape = var.dims();
+            weights.push(take("weights", name, shape)?);
+            averages.push(take("average", name, shape)?);
+            moments.push((take("first", name, shape)?, take("second", name, shape)?));
+        }
+        let idle = |(weight, counts): (usize, Vec<f32>)| take("idle", &self.vars[weight].0, &[counts.len()]);
+        let idle = self.idle.counts().map(idle).collect::<Result<_>>()?;
+        let mut centres = Vec::new();
+        for (weight, bias) in self.idle.layers().filter(|_| meta.step > 0) {
+            let (Some(bias), Some(inputs)) = (bias, self.adam.centred_inputs(weight)) else { continue };
+            centres.push((weight, Centre { bias, means: take("means", &self.vars[weight].0, &[inputs])? }));
         }
         // Only now that all is there does anything change.
         for ((_, var), weights) in self.vars.iter().zip(weights) {
             var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
         }
         self.average = averages;
+        self.idle.restore(idle);
         self.adam.restore(meta.adam_steps, moments);
+        centres.into_iter().for_each(|(weight, centre)| self.adam.set_centre(weight, centre));
         self.step = meta.step;
         Ok(())
     }

@@ -25,6 +25,9 @@ enum Line {
         loss: f64,
         gradient_norm: f64,
         learning_rate: f64,
+        /// Channels that began anew, in all of them.
+        #[serde(default)]
+        revived: usize,
     },
 }
 
@@ -88,6 +91,7 @@ impl Log {
             loss: mean(|r| f64::from(r.loss)),
             gradient_norm: mean(|r| r.gradient_norm),
             learning_rate: report.learning_rate,
+            revived: steps.iter().map(|r| r.revived).sum(),
         })
     }
 
@@ -99,13 +103,16 @@ impl Log {
         Ok(format!("step {step}   {}", scores.join("   ")))
     }
 
-    /// The latest loss.
+    /// The latest loss, and how many channels have begun anew.
     pub(super) fn message(&self) -> String {
-        let steps = self.lines.iter().rev().find_map(|line| match line {
-            Line::Steps { loss, .. } => Some(format!("loss {loss:.5}")),
+        let steps = self.lines.iter().filter_map(|line| match line {
+            Line::Steps { loss, revived, .. } => Some((*loss, *revived)),
             Line::Validation { .. } => None,
         });
-        steps.unwrap_or_default()
+        let Some((loss, revived)) = steps.reduce(|(_, before), (loss, revived)| (loss, before + revived)) else {
+            return String::new();
+        };
+        if revived == 0 { format!("loss {loss:.5}") } else { format!("loss {loss:.5}   {revived} channels revived") }
     }
 
     pub(super) fn flush(&mut self) -> anyhow::Result<()> {
@@ -192,7 +199,7 @@ mod tests {
     use super::*;
 
     fn report(step: u64) -> StepReport {
-        StepReport { step, loss: 1.0 / step as f32, learning_rate: 1e-3, gradient_norm: 1.0 }
+        StepReport { step, loss: 1.0 / step as f32, learning_rate: 1e-3, gradient_norm: 1.0, revived: 0 }
     }
 
     #[test]
