@@ -50,6 +50,17 @@ pub fn data_root() -> Option<PathBuf> {
     None
 }
 
+/// An experiment of `configs`, on the demo's video.
+///
+/// # Panics
+/// If there is no such experiment.
+pub fn on_the_demo(config: &str) -> String {
+    let config = std::fs::read_to_string(workspace().join("configs").join(config)).expect("a file of configs");
+    let video = format!("kind = \"simulate\"\npath = '{}'\n", workspace().join("configs/demo/bunny").display());
+    let data = config.find("path = ").expect("a path")..config.find("[solver]").expect("a solver");
+    [&config[..data.start], &video, "[data.mask]\nkind = \"random\"\n", &config[data.end..]].concat()
+}
+
 /// What a run of `sci` left behind.
 #[derive(Debug)]
 pub struct Finished {

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use e2e::{Bench, workspace};
+use e2e::{Bench, on_the_demo, workspace};
 
 /// Runs a config on measurement 0 and gives the video as the bytes of its file.
 fn run(bench: &Bench, config: &Path, out: &str, set: &[&str]) -> Vec<u8> {
@@ -13,14 +13,6 @@ fn run(bench: &Bench, config: &Path, out: &str, set: &[&str]) -> Vec<u8> {
     let run = bench.finish(command.arg(config));
     assert_eq!(run.code, 0, "{}", run.stderr);
     std::fs::read(bench.path(&format!("{out}/recon.npy"))).unwrap()
-}
-
-/// An experiment of `configs`, on the demo's video.
-fn on_the_demo(config: &str) -> String {
-    let config = std::fs::read_to_string(workspace().join("configs").join(config)).unwrap();
-    let video = format!("kind = \"simulate\"\npath = '{}'\n", workspace().join("configs/demo/bunny").display());
-    let data = config.find("path = ").unwrap()..config.find("[solver]").unwrap();
-    [&config[..data.start], &video, "[data.mask]\nkind = \"random\"\n", &config[data.end..]].concat()
 }
 
 #[test]
@@ -73,16 +65,19 @@ fn tv_goes_first_only_once() {
     assert!(iterations_of_tv("solver={kind=\"gap\",start=\"mean\"}") > 0);
 }
 
-/// A network that was trained for the σ of its schedule is given all of them, until the run stops.
+/// A network that was trained for the σ of its schedule is given all of them, until the run stops, unless the experiment says otherwise.
 #[test]
 fn the_sigmas_of_a_network_for_iterates_are_not_passed_over() {
     let bench = Bench::new();
     std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
     // Far above what is left of the error after the start.
     let stages = "stage=[{sigma=100,iterations=1},{sigma=50,iterations=1},{sigma=7,iterations=1}]";
-    run(&bench, &bench.path("default.toml"), "out", &[stages, "skip.enabled=true"]);
-    let sigmas = bench.record("out")["measurements"][0]["trace"]["sigma"].as_array().unwrap().len();
-    assert_eq!(sigmas, 3);
+    let calls = |overshoot: &[&str]| {
+        run(&bench, &bench.path("default.toml"), "out", &[&[stages, "skip.enabled=true"], overshoot].concat());
+        bench.record("out")["measurements"][0]["trace"]["sigma"].as_array().unwrap().len()
+    };
+    assert_eq!(calls(&[]), 3);
+    assert!(calls(&["skip.overshoot=2"]) < 3);
 }
 
 #[test]

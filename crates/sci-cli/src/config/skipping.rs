@@ -15,6 +15,8 @@ use super::source::ConfigError;
 pub struct Skip {
     /// When stages end.
     pub hold_out: HoldOut,
+    /// Whether the experiment says which σ are too large.
+    pub overshoot_given: bool,
     /// Whether networks are spared tiles that stand still or have settled.
     pub tiles: bool,
     /// Whether networks work in bf16 where the solve would not notice.
@@ -49,6 +51,7 @@ impl<'s> Checker<'s> {
         };
         let skip = Skip {
             hold_out,
+            overshoot_given: k.overshoot.is_some(),
             tiles: self.flag("skip.tiles", &k.tiles)?.unwrap_or(true),
             half_precision: self.flag("skip.half_precision", &k.half_precision)?.unwrap_or(true),
             cheap_first: self.flag("skip.cheap_first", &k.cheap_first)?.unwrap_or(true),
@@ -59,9 +62,9 @@ impl<'s> Checker<'s> {
 
 impl Skip {
     /// Networks for iterates were trained for the σ of their schedule: passing some of them over cost 0.1 to 1 dB on the benchmark.
-    /// Stops, tiles and the best iterate are theirs all the same.
+    /// Stops, tiles and the best iterate are theirs all the same, and so is an `overshoot` that the experiment asks for.
     pub(super) fn keep_trained_sigmas(&mut self, denoisers: &[Denoiser]) {
-        if denoisers.iter().any(Denoiser::for_iterates) {
+        if !self.overshoot_given && denoisers.iter().any(Denoiser::for_iterates) {
             self.hold_out.overshoot = *OVERSHOOT.end();
         }
     }
