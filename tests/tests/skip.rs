@@ -72,12 +72,15 @@ fn the_sigmas_of_a_network_for_iterates_are_not_passed_over() {
     std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml")).unwrap();
     // Far above what is left of the error after the start.
     let stages = "stage=[{sigma=100,iterations=1},{sigma=50,iterations=1},{sigma=7,iterations=1}]";
-    let calls = |overshoot: &[&str]| {
+    let sigmas = |overshoot: &[&str]| -> Vec<i64> {
         run(&bench, &bench.path("default.toml"), "out", &[&[stages, "skip.enabled=true"], overshoot].concat());
-        bench.record("out")["measurements"][0]["trace"]["sigma"].as_array().unwrap().len()
+        let record = bench.record("out");
+        let sigmas = record["measurements"][0]["trace"]["sigma"].as_array().unwrap();
+        sigmas.iter().map(|sigma| (255.0 * sigma.as_f64().unwrap()).round() as i64).collect()
     };
-    assert_eq!(calls(&[]), 3);
-    assert!(calls(&["skip.overshoot=2"]) < 3);
+    assert_eq!(sigmas(&[]), [100, 50, 7]);
+    // The calls that are passed over go to the stage after them.
+    assert_eq!(sigmas(&["skip.overshoot=2"]), [7, 7, 7]);
 }
 
 #[test]
