@@ -30,9 +30,12 @@ pub(super) struct Centre {
 impl Centre {
     /// The gradient of a weight `[O, I, 3, 3]` in the coordinates `W (x − mean) + b'`.
     fn gradient(&self, of_weight: &[f32], of_bias: &[f32]) -> Vec<f32> {
+        let mut around = of_weight.to_vec();
         let filters = of_bias.iter().flat_map(|b| self.means.iter().map(move |mean| b * mean));
-        let around = |(filter, b): (&[f32], f32)| filter.iter().map(move |g| g - b).collect::<Vec<_>>();
-        of_weight.chunks_exact(9).zip(filters).flat_map(around).collect()
+        for (filter, b) in around.chunks_exact_mut(9).zip(filters) {
+            filter.iter_mut().for_each(|g| *g -= b);
+        }
+        around
     }
 
     /// `W mean`: what a weight makes of the means.
