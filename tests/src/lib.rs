@@ -50,15 +50,15 @@ pub fn data_root() -> Option<PathBuf> {
     None
 }
 
-/// An experiment of `configs`, on the demo's video.
+/// An experiment of `configs`, on the demo's video through a mask (the keys of `[data.mask]`).
 ///
 /// # Panics
 /// If there is no such experiment.
-pub fn on_the_demo(config: &str) -> String {
+pub fn on_the_demo(config: &str, mask: &str) -> String {
     let config = std::fs::read_to_string(workspace().join("configs").join(config)).expect("a file of configs");
     let video = format!("kind = \"simulate\"\npath = '{}'\n", workspace().join("configs/demo/bunny").display());
     let data = config.find("path = ").expect("a path")..config.find("[solver]").expect("a solver");
-    [&config[..data.start], &video, "[data.mask]\nkind = \"random\"\n", &config[data.end..]].concat()
+    [&config[..data.start], &video, "[data.mask]\n", mask, "\n", &config[data.end..]].concat()
 }
 
 /// What a run of `sci` left behind.

@@ -1,6 +1,6 @@
 //! What a denoiser gained by training on iterates is no habit of the masks it was trained with.
 
-use e2e::{Bench, workspace};
+use e2e::{Bench, on_the_demo};
 use ndarray::Array3;
 
 const FRAMES: usize = 4;
@@ -42,16 +42,21 @@ fn hadamard((t, y, x): (usize, usize, usize)) -> bool {
 
 /// PSNR in the schedule that `gray/default.toml` has for the trained denoiser.
 fn psnr(bench: &Bench, mask: &str, weights: &str) -> f64 {
-    let default = std::fs::read_to_string(workspace().join("configs/gray/default.toml")).unwrap();
-    let (start, end) = (default.find("path = ").unwrap(), default.find("[solver]").unwrap());
-    let scene = workspace().join("configs/demo/bunny");
-    let data = format!(
-        "kind = \"simulate\"\npath = '{}'\nmeasurements = [0]\n[data.mask]\nkind = \"file\"\npath = \"{mask}.npy\"\n",
-        scene.display()
-    );
-    bench.write("scene.toml", [&default[..start], &data, &default[end..]].concat());
+    let mask = format!("kind = \"file\"\npath = \"{mask}.npy\"");
+    bench.write("scene.toml", on_the_demo("gray/default.toml", &mask));
     let set = format!("denoiser.weights=bundled:{weights}");
-    let run = bench.sci(&["run", "scene.toml", "--out", "out", "--set", &set, "--set", "output.frames=false"]);
+    let run = bench.sci(&[
+        "run",
+        "scene.toml",
+        "--out",
+        "out",
+        "--set",
+        &set,
+        "--set",
+        "output.frames=false",
+        "--set",
+        "data.measurements=[0]",
+    ]);
     assert_eq!(run.code, 0, "{}", run.stderr);
     bench.record("out")["measurements"][0]["psnr_db"].as_f64().unwrap()
 }

@@ -1,9 +1,8 @@
 //! Convolution layers with optional batch norm, and where their tensors come from.
 
-use crate::kernels::{Conv3x3, Link, Precision, conv_chain};
+use crate::kernels::{Conv3x3, Link, Precision, conv_chain, layer_by_layer};
 use crate::{Error, KeyReport};
 use candle_core::{Device, Tensor, Var};
-use candle_nn::ops::pixel_shuffle;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::collections::BTreeMap;
@@ -203,27 +202,14 @@ pub(crate) fn chain(convs: &[Conv], ways: &[(usize, usize)], x: &Tensor) -> cand
     if convs.iter().all(|conv| conv.input_means.is_none()) {
         return conv_chain(x, &links);
     }
-    let means: Vec<_> = convs.iter().map(|conv| conv.input_means.as_deref()).collect();
-    watched(&links, &means, x)
-}
-
-/// As [`conv_chain`], layer by layer; the means of what goes into each go to `means`.
-fn watched(links: &[Link], means: &[Option<&OnceLock<Vec<f32>>>], x: &Tensor) -> candle_core::Result<Tensor> {
-    let mut results: Vec<Tensor> = Vec::new();
-    for (link, means) in links.iter().zip(means) {
-        let input = results.last().unwrap_or(x);
-        if let Some(means) = means {
+    layer_by_layer(x, &links, |i, input| {
+        if let Some(means) = &convs[i].input_means {
             let of_channels = input.transpose(0, 1)?.flatten_from(1)?.mean(1)?.to_vec1()?;
             // A second pass finds the first one's.
             let _ = means.set(of_channels);
         }
-        let y = conv_chain(input, &[Link { onto: None, ..link.clone() }])?;
-        results.push(match link.onto {
-            None => y,
-            Some(earlier) => (&results[earlier] + pixel_shuffle(&y, 2)?)?,
-        });
-    }
-    Ok(results.pop().unwrap_or_else(|| x.clone()))
+        conv_chain(input, &[Link { onto: None, ..links[i].clone() }])
+    })
 }
 
 /// How a tensor starts when it is not loaded.

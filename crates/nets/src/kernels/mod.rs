@@ -113,6 +113,7 @@ mod winograd;
 pub use blocked::Blocked;
 pub use conv::PackedConv;
 pub use memory::keep_freed_memory;
+pub(crate) use op::layer_by_layer;
 pub use op::{Conv3x3, Link, Precision, conv_chain, conv3x3, conv3x3_on};
 pub use peak::gemm_peak;
 pub use scratch::Scratch;

@@ -138,14 +138,23 @@ pub fn conv_chain(x: &Tensor, links: &[Link]) -> Result<Tensor> {
         let isa = if bf16 { Isa::detect() } else { Isa::detect_for_gradients() };
         return Chain::run(isa.map_err(Error::wrap)?, x, links);
     }
+    layer_by_layer(x, links, |i, input| links[i].by_candle(input))
+}
+
+/// A chain whose layers, without the ways around others, are done by `layer`, which is given the number of each and its input.
+pub(crate) fn layer_by_layer(
+    x: &Tensor,
+    links: &[Link],
+    mut layer: impl FnMut(usize, &Tensor) -> Result<Tensor>,
+) -> Result<Tensor> {
     let mut results: Vec<Tensor> = Vec::new();
-    for link in links {
-        let y = link.by_candle(results.last().unwrap_or(x))?;
+    for (i, link) in links.iter().enumerate() {
+        let y = layer(i, results.last().unwrap_or(x))?;
         results.push(match link.onto {
             None => y,
-            Some(layer) => match results.get(layer) {
+            Some(onto) => match results.get(onto) {
                 Some(earlier) => (earlier + candle_nn::ops::pixel_shuffle(&y, 2)?)?,
-                None => candle_core::bail!("conv_chain: layer {} goes onto layer {layer}", results.len()),
+                None => candle_core::bail!("conv_chain: layer {i} goes onto layer {onto}"),
             },
         });
     }
