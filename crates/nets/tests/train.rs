@@ -77,7 +77,9 @@ fn resuming_is_the_straight_run_bit_for_bit() {
     let path = folder.path().join("run.safetensors");
     // Wide enough for Muon's steps, and long enough to begin between two measurements of what the layers are given.
     let wide = NetworkConfig::Ffdnet { channels: 1, width: 16, depth: 4 };
-    for (network, frames, steps) in [(FFDNET, 1, 6), (FASTDVDNET, 3, 6), (DDNET, 3, 6), (wide, 1, 46)] {
+    let wide_video = NetworkConfig::Fastdvdnet { channels: 1, widths: [4, 16, 16], ends: nets::Ends::Circular };
+    let networks = [(FFDNET, 1, 6), (FASTDVDNET, 3, 6), (DDNET, 3, 6), (wide, 1, 46), (wide_video, 3, 26)];
+    for (network, frames, steps) in networks {
         let mut config = config(network, frames, steps);
         // Channels begin anew all the time.
         config.training.revive = 1;
@@ -143,6 +145,32 @@ fn training_on_iterates_learns_resumes_and_validates_by_reconstruction() {
         assert_eq!(bits(&second), bits(&straight));
         let after = straight.validate().unwrap();
         assert!(after[0].psnr_db > before[0].psnr_db + 1.0, "{before:?} {after:?}");
+    }
+}
+
+#[test]
+fn random_weights_begin_as_the_residual_connection_with_open_relus() {
+    for (network, frames, blocks) in [(FFDNET, 1, 1), (FASTDVDNET, 3, 2), (DDNET, 3, 2)] {
+        let mut config = config(network, frames, 1);
+        config.training.learning_rate = 1e-9;
+        let mut first = trainer(&config);
+        let weights = |trainer: &Trainer| trainer.weights().unwrap();
+        let before = weights(&first);
+        run(&mut first, 1);
+        let largest = |t: &candle_core::Tensor| {
+            let values = t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            values.into_iter().map(f32::abs).fold(0.0, f32::max)
+        };
+        let after = weights(&first);
+        let silent = after.iter().filter(|(name, t)| name.ends_with(".weight") && largest(t) < 1e-6).count();
+        assert_eq!(silent, blocks);
+        let moved = after.iter().filter(|(name, t)| name.ends_with(".bias") && largest(t) > 1e-3).count();
+        assert!(moved >= blocks, "{moved}");
+        // Weights that were given are taken as they are.
+        let mut second = trainer(&config);
+        second.start_from(&before).unwrap();
+        run(&mut second, 1);
+        assert!(weights(&second).iter().filter(|(name, _)| name.ends_with(".bias")).all(|(_, t)| largest(t) < 1e-6));
     }
 }
 
@@ -245,11 +273,11 @@ fn a_checkpoint_of_other_settings_is_refused() {
     trainer(&moved).resume(&path).unwrap();
 }
 
-/// Training on one still image without noise: the loss falls to a twentieth.
+/// Training on one still image: less than half of the noise is left.
 fn overfit(network: NetworkConfig, frames: usize, steps: usize) {
     let mut config = config(network, frames, steps as u64);
     config.data.photo_share = 0.0;
-    config.noise = Some(NoiseConfig { sigma: [0.0, 0.0] });
+    config.noise = Some(NoiseConfig { sigma: [50.0, 50.0] });
     config.training.learning_rate = 1e-2;
     let wave = |c: usize, y: usize, x: usize| (0.4 * y as f32 + c as f32).sin() + (0.3 * x as f32).cos();
     let shape = (config.network.channels(), 16, 16);
@@ -258,7 +286,7 @@ fn overfit(network: NetworkConfig, frames: usize, steps: usize) {
     let mut trainer = Trainer::new(config, data).unwrap();
     let reports = run(&mut trainer, steps);
     let last: f32 = reports[steps - 5..].iter().map(|r| r.loss).sum::<f32>() / 5.0;
-    assert!(last < reports[0].loss / 20.0, "{} → {last}", reports[0].loss);
+    assert!(last < reports[0].loss / 2.0, "{} → {last}", reports[0].loss);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //! [`Trainer`] owns one run; the caller loops over [`Trainer::step`], validates and saves when it likes.
 
 mod adam;
+mod centre;
 mod checkpoint;
 mod config;
 mod data;

@@ -1,6 +1,7 @@
 //! The training loop's body.
 
-use super::adam::{Adam, Centre};
+use super::adam::Adam;
+use super::centre::{Centre, Variables, open};
 use super::checkpoint::{self, Meta};
 use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
@@ -190,6 +191,8 @@ pub struct Trainer {
     adam: Adam,
     average: Vec<Vec<f32>>,
     idle: Idle,
+    /// Whether it began with random weights.
+    random: bool,
     step: u64,
 }
 
@@ -243,7 +246,7 @@ impl Trainer {
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         let idle = Idle::new(&model.network().convs(), &vars);
-        Ok(Self { config, data, model, vars, adam, average, idle, step: 0 })
+        Ok(Self { config, data, model, vars, adam, average, idle, random: true, step: 0 })
     }
 
     /// Begins with these weights instead of random ones.
@@ -255,6 +258,7 @@ impl Trainer {
         self.vars = self.model.network_mut().make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        self.random = false;
         Ok(())
     }
 
@@ -354,6 +358,9 @@ impl Trainer {
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
+        if self.step == 0 && self.random {
+            self.open_layers(&lessons[0])?;
+        }
         if self.config.training.optimizer == Optimizer::Muon && self.step.is_multiple_of(CENTRE_EVERY) {
             self.find_centres(&lessons[0])?;
         }
@@ -373,8 +380,32 @@ impl Trainer {
         Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm, revived })
     }
 
+    /// Random weights to begin with, layer after layer, as each changes what the next is given.
+    fn open_layers(&mut self, lesson: &Lesson) -> Result<()> {
+        for (i, (weight, bias)) in self.idle.layers().enumerate() {
+            let watched = self.watched(lesson)?;
+            let conv = watched.network().convs()[i];
+            let Some(means) = conv.input_means() else { continue };
+            let var = |number: usize| &self.vars[number].1;
+            open(conv, means, Variables { weight: var(weight), bias: bias.map(var) })?;
+        }
+        self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        Ok(())
+    }
+
     /// What each layer is given on average, from what a lesson begins with.
     fn find_centres(&mut self, lesson: &Lesson) -> Result<()> {
+        let watched = self.watched(lesson)?;
+        for (conv, (weight, bias)) in watched.network().convs().into_iter().zip(self.idle.layers()) {
+            if let Some(means) = conv.input_means() {
+                self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
+            }
+        }
+        Ok(())
+    }
+
+    /// The model after a pass of what a lesson begins with, in which it noted the means.
+    fn watched(&self, lesson: &Lesson) -> Result<Model> {
         let mut watched = self.model.clone();
         watched.network_mut().convs_mut().into_iter().for_each(Conv::watch);
         match lesson {
@@ -384,12 +415,7 @@ impl Trainer {
                 watched.network().forward(&tensor(first.input.clone())?, &[first.sigma])?
             }
         };
-        for (conv, (weight, bias)) in watched.network().convs().into_iter().zip(self.idle.layers()) {
-            if let (Some(bias), Some(means)) = (bias, conv.input_means()) {
-                self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
-            }
-        }
-        Ok(())
+        Ok(watched)
     }
 
     /// Lets channels that were idle for long begin anew, while there is time for them to learn.
@@ -575,7 +601,7 @@ impl Trainer {
         let idle = self.idle.counts().map(idle).collect::<Result<_>>()?;
         let mut centres = Vec::new();
         for (weight, bias) in self.idle.layers().filter(|_| meta.step > 0) {
-            let (Some(bias), Some(inputs)) = (bias, self.adam.centred_inputs(weight)) else { continue };
+            let Some(inputs) = self.adam.centred_inputs(weight) else { continue };
             centres.push((weight, Centre { bias, means: take("means", &self.vars[weight].0, &[inputs])? }));
         }
         // Only now that all is there does anything change.
