@@ -55,6 +55,8 @@ struct Curve {
     weights: Option<&'static str>,
     /// σ of the stages, in 0..255 units; one stage without σ if there are none.
     sigmas: &'static [f32],
+    /// σ of the stages of WNNM after them; with any, those before take one iteration each.
+    refined: &'static [f32],
     /// Iterations of each stage.
     budgets: &'static [usize],
 }
@@ -62,6 +64,9 @@ struct Curve {
 const SIGMAS: &[f32] = &[50.0, 25.0, 12.0, 6.0];
 const TV: &[usize] = &[4, 8, 16, 40, 80];
 const NET: &[usize] = &[1, 2, 3, 5, 10];
+/// What the networks were trained for that know a solver's iterates.
+const GRAY_ITERATES: &[f32] = &[20.0, 18.0, 17.0, 16.0, 15.0, 14.0, 13.0, 12.0, 10.0, 9.0, 8.0, 7.0];
+const COLOR_ITERATES: &[f32] = &[20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 8.0, 7.0];
 
 const GRAY: &[Curve] = &[
     Curve {
@@ -69,6 +74,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\nmomentum = 'zero'\nstart = 'adjoint'\n[denoiser]\nkind = 'tv'\nweight = 0.3\n",
         weights: None,
         sigmas: &[],
+        refined: &[],
         budgets: TV,
     },
     Curve {
@@ -76,6 +82,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'tv'\nweight = 0.15\n",
         weights: None,
         sigmas: &[],
+        refined: &[],
         budgets: TV,
     },
     Curve {
@@ -83,6 +90,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'admm'\n[denoiser]\nkind = 'tv'\nweight = 0.15\n",
         weights: None,
         sigmas: &[],
+        refined: &[],
         budgets: TV,
     },
     Curve {
@@ -90,6 +98,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\nmomentum = 'zero'\nstart = 'adjoint'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray_ipol.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: NET,
     },
     Curve {
@@ -97,6 +106,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: NET,
     },
     Curve {
@@ -104,6 +114,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\naccelerate = false\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: NET,
     },
     Curve {
@@ -111,6 +122,7 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'admm'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: NET,
     },
     Curve {
@@ -118,6 +130,7 @@ const GRAY: &[Curve] = &[
         experiment: "[skip]\n[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: &[5, 10],
     },
     Curve {
@@ -125,7 +138,16 @@ const GRAY: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n",
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
+        refined: &[],
         budgets: &[1, 2, 3],
+    },
+    Curve {
+        name: "GAP-FastDVDnet for iterates, then WNNM",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n",
+        weights: None,
+        sigmas: GRAY_ITERATES,
+        refined: &[12.0, 8.0],
+        budgets: &[1, 2, 4, 6],
     },
 ];
 
@@ -135,6 +157,7 @@ const COLOR: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'tv'\nweight = 0.1\n",
         weights: None,
         sigmas: &[],
+        refined: &[],
         budgets: TV,
     },
     Curve {
@@ -142,6 +165,7 @@ const COLOR: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
@@ -149,6 +173,7 @@ const COLOR: &[Curve] = &[
         experiment: "[solver]\nkind = 'two-stage'\nstart_iterations = 40\nstart = 'tv'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
@@ -156,6 +181,7 @@ const COLOR: &[Curve] = &[
         experiment: "[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
@@ -163,6 +189,7 @@ const COLOR: &[Curve] = &[
         experiment: "[skip]\n[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n",
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
+        refined: &[],
         budgets: &[4],
     },
     Curve {
@@ -170,7 +197,16 @@ const COLOR: &[Curve] = &[
         experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n",
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
+        refined: &[],
         budgets: &[1, 2, 3],
+    },
+    Curve {
+        name: "GAP-FastDVDnet for iterates, then WNNM",
+        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n",
+        weights: None,
+        sigmas: COLOR_ITERATES,
+        refined: &[12.0, 8.0],
+        budgets: &[1, 2, 4, 6],
     },
 ];
 
@@ -335,8 +371,12 @@ fn experiment(curve: &Curve, budget: usize, data: &Path, shared: &Path) -> Strin
     if let Some(weights) = curve.weights {
         text += &format!("weights = '{}'\n", shared.join("weights").join(weights).display());
     }
+    let before = if curve.refined.is_empty() { budget } else { 1 };
     for sigma in curve.sigmas {
-        text += &format!("[[stage]]\nsigma = {sigma}\niterations = {budget}\n");
+        text += &format!("[[stage]]\nsigma = {sigma}\niterations = {before}\n");
+    }
+    for sigma in curve.refined {
+        text += &format!("[[stage]]\nsigma = {sigma}\niterations = {budget}\n[stage.denoiser]\nkind = 'wnnm'\n");
     }
     if curve.sigmas.is_empty() {
         text += &format!("[[stage]]\niterations = {budget}\n");
