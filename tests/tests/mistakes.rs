@@ -100,7 +100,13 @@ fn wrong_type() {
 #[test]
 fn out_of_range() {
     config_fails("iterations = 2", "iterations = -2", &["a.toml:9:", "`stage.0.iterations` = -2", "0 to 100000"]);
-    config_fails("iterations = 2", "iterations = 2\nsigma = 300", &["a.toml:10:", "`stage.0.sigma` = 300", "0 to 255"]);
+    for (sigma, legal) in
+        [("300", "0 to 255"), ("[]", "in a list"), ("[20, 300]", "0 to 255"), ("[20, true]", "in a list")]
+    {
+        let stage = format!("kind = \"wnnm\"\n[[stage]]\nsigma = {sigma}");
+        let problem = format!("`stage.0.sigma` = {sigma}");
+        config_fails("kind = \"tv\"\n[[stage]]", &stage, &["a.toml:9:", &problem, legal]);
+    }
     config_fails("kind = \"tv\"", "kind = \"tv\"\nweight = nan", &["`denoiser.weight` = nan", "0.000001 to 100"]);
     config_fails("[data]", "name = \"../up\"\n[data]", &["a.toml:2:", "`name` = \"../up\""]);
     config_fails("[data]", "seed = -1\n[data]", &["`seed` = -1", "at least 0"]);

@@ -235,6 +235,8 @@ const PATTERNS: [(&str, CfaPattern); 4] =
 const DEFECTS: [(&str, Defects); 2] = [("keep", Defects::Keep), ("exclude", Defects::Exclude)];
 pub(super) const MAX_ITERATIONS: i64 = 100_000;
 const SEEDS: RangeInclusive<i64> = 0..=i64::MAX;
+/// Of a stage, in 0..255 units.
+const SIGMAS: RangeInclusive<f64> = 0.0..=255.0;
 
 /// Checks an experiment.
 ///
@@ -550,48 +552,58 @@ impl<'s> Checker<'s> {
                 }
             };
             let k: StageKeys = section.read(&["denoiser"])?;
-            let auto = k.sigma.as_ref().filter(|sigma| sigma.get_ref().as_str() == Some("auto"));
-            let sigma = match auto {
-                None => self.number(&format!("{key}.sigma"), &k.sigma, 0.0..=255.0)?,
-                Some(sigma) if !skips => {
-                    let problem =
-                        format!("`{key}.sigma` = \"auto\" is decided by held-out pixels: it needs skip.enabled = true");
-                    return Err(self.source.error(&sigma.span(), problem));
-                }
-                Some(sigma) if denoisers[denoiser].for_iterates() => {
-                    let problem = format!(
-                        "`{key}.sigma` = \"auto\" is for networks of any σ; this one was trained for the σ of its schedule"
-                    );
-                    return Err(self.source.error(&sigma.span(), problem));
-                }
-                Some(_) => Some(AUTO[0]),
-            };
+            let sigmas = self.sigmas(&key, &span, &k.sigma, &denoisers[denoiser], skips)?;
             let iterations =
                 self.whole(&format!("{key}.iterations"), &k.iterations, 0..=MAX_ITERATIONS)?.ok_or_else(|| {
                     self.source.error(&span, format!("`{key}.iterations` is missing; legal: 0 to {MAX_ITERATIONS}"))
                 })?;
-            let sigma = match (&denoisers[denoiser], sigma, &k.sigma) {
-                (Denoiser::Tv { .. }, Some(_), Some(given)) => {
-                    return Err(self.source.error(
-                        &given.span(),
-                        format!("`{key}.sigma` has no effect: its denoiser is tv, whose strength is denoiser.weight"),
-                    ));
-                }
-                (Denoiser::Tv { .. }, ..) => 0.0,
-                (_, Some(sigma), _) => sigma as f32,
-                (_, None, _) => {
-                    return Err(self.source.error(
-                        &span,
-                        format!("`{key}.sigma` is missing; legal: 0 to 255, in units of an 8-bit picture"),
-                    ));
-                }
-            };
-            let more = if auto.is_some() { &AUTO[1..] } else { &[] };
-            for sigma in std::iter::once(sigma).chain(more.iter().map(|&sigma| sigma as f32)) {
-                stages.push(Stage { sigma, iterations: iterations as usize, denoiser });
-            }
+            let stage = |sigma| Stage { sigma, iterations: iterations as usize, denoiser };
+            stages.extend(sigmas.into_iter().map(stage));
         }
         Ok(stages)
+    }
+
+    /// σ of a `[[stage]]`: one, or one for each of the stages that it stands for.
+    fn sigmas(
+        &self,
+        stage: &str,
+        table: &Range<usize>,
+        value: &Value,
+        denoiser: &Denoiser,
+        skips: bool,
+    ) -> Result<Vec<f32>, ConfigError> {
+        let key = format!("{stage}.sigma");
+        let is_tv = matches!(denoiser, Denoiser::Tv { .. });
+        let refuse = |problem: &str| {
+            let place = value.as_ref().map_or_else(|| table.clone(), |given| given.span());
+            Err(self.source.error(&place, format!("`{key}` {problem}")))
+        };
+        let Some(given) = value else {
+            return if is_tv {
+                Ok(vec![0.0])
+            } else {
+                refuse("is missing; legal: 0 to 255, in units of an 8-bit picture")
+            };
+        };
+        match given.get_ref() {
+            _ if is_tv => refuse("has no effect: its denoiser is tv, whose strength is denoiser.weight"),
+            Toml::String(auto) if auto == "auto" && !skips => {
+                refuse("= \"auto\" is decided by held-out pixels: it needs skip.enabled = true")
+            }
+            Toml::String(auto) if auto == "auto" && denoiser.for_iterates() => {
+                refuse("= \"auto\" is for networks of any σ; this one was trained for the σ of its schedule")
+            }
+            Toml::String(auto) if auto == "auto" => Ok(AUTO.map(|sigma| sigma as f32).to_vec()),
+            Toml::Array(list) => {
+                let legal = "numbers from 0 to 255 in a list, in units of an 8-bit picture, one for each stage";
+                let each = |v: &Toml| as_number(v).filter(|sigma| SIGMAS.contains(sigma)).map(|sigma| sigma as f32);
+                let sigmas = self.legal(&key, value, legal, |_| {
+                    list.iter().map(each).collect::<Option<Vec<_>>>().filter(|sigmas| !sigmas.is_empty())
+                })?;
+                Ok(sigmas.unwrap_or_default())
+            }
+            _ => Ok(self.number(&key, value, SIGMAS)?.map(|sigma| sigma as f32).into_iter().collect()),
+        }
     }
 
     fn stop(&self, section: Option<Section<'s>>) -> Result<(f64, Option<f64>), ConfigError> {
@@ -655,7 +667,6 @@ impl<'s> Checker<'s> {
         let unit =
             if key.ends_with("sigma") || key.ends_with("input_noise") { ", in units of an 8-bit picture" } else { "" };
         let legal = format!("a number from {} to {}{unit}", range.start(), range.end());
-        let as_number = |v: &Toml| v.as_float().or_else(|| v.as_integer().map(|i| i as f64));
         self.legal(key, value, &legal, |v| as_number(v).filter(|x| range.contains(x)))
     }
 
@@ -693,6 +704,10 @@ impl<'s> Checker<'s> {
         let value = self.source.snippet(span);
         self.source.error(span, format!("`{key}` = {value} is not available yet; available: {available}"))
     }
+}
+
+fn as_number(value: &Toml) -> Option<f64> {
+    value.as_float().or_else(|| value.as_integer().map(|i| i as f64))
 }
 
 /// Leaves out the denoisers of schedules that are not run, so that nothing is loaded for them.

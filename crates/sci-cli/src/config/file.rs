@@ -162,7 +162,7 @@ pub struct VideoNetKeys {
     pub ends: Value,
 }
 
-/// One `[[stage]]`; its own `denoiser` table is read apart.
+/// One `[[stage]]`, or several of equal length with σ from a list; its own `denoiser` table is read apart.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]

@@ -470,3 +470,24 @@ fn denoiser_json(d: &Denoiser) -> Value {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_of_sigmas_is_that_many_stages() {
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+        let stages = |more: &str| {
+            let path = format!("data.path={}", configs.join("demo/bunny").display());
+            let experiment = load(&configs.join("gray/refined.toml"), &[path, more.into()]).unwrap();
+            experiment.stages.iter().map(|s| (s.sigma * SIGMA_UNIT, s.iterations, s.denoiser)).collect::<Vec<_>>()
+        };
+        let refined = stages("seed=0");
+        assert_eq!(refined.len(), 14);
+        assert_eq!(refined[..2], [(20.0, 1, 0), (18.0, 1, 0)]);
+        assert_eq!(refined[12..], [(12.0, 6, 1), (8.0, 6, 1)]);
+        let written_out = "stage=[{sigma=9.5,iterations=3},{sigma=4,iterations=3}]";
+        assert_eq!(stages("stage=[{sigma=[9.5, 4],iterations=3}]"), stages(written_out));
+    }
+}
