@@ -132,11 +132,15 @@ vectorised! {
 vectorised! {
     /// `filter = V diag(ŝ / s) Vᵀ` with `gram = V diag(s²) Vᵀ`, both `[D][D]`; s is shrunk to 0 where s² is not above `least`.
     ///
-    /// One-sided Jacobi rotations make the columns of `gram` orthogonal: they become s² V. Eigenvectors that are shrunk away need not be
-    /// exact.
+    /// One-sided Jacobi rotations make the columns of `gram` orthogonal: they become s² V, the largest first. Eigenvectors that are shrunk
+    /// away need not be exact: once a sweep has gathered what is strong in the first columns, pairs of weak ones are left alone.
     fn filters(gram: &mut [Lanes], pixels: usize, least: &Lanes, filter: &mut [Lanes]) {
+        let mut weak = [0f32; GROUPS];
+        for (weak, least) in weak.iter_mut().zip(least) {
+            *weak = 0.25 * least * least;
+        }
         let mut norms = vec![[0.0; GROUPS]; pixels];
-        for _ in 0..SWEEPS {
+        for sweep in 0..SWEEPS {
             for (column, norm) in gram.chunks_exact(pixels).zip(&mut norms) {
                 *norm = dot(column, column);
             }
@@ -146,7 +150,10 @@ vectorised! {
                 let (norms_before, norms_from_q) = norms.split_at_mut(q);
                 let columns = before.chunks_exact_mut(pixels).zip(norms_before);
                 for (p, a) in columns {
-                    rotate((p, a), (&mut from_q[..pixels], &mut norms_from_q[0]), least, &mut worst);
+                    let b = &mut norms_from_q[0];
+                    if sweep == 0 || any_above(a, b, &weak) {
+                        rotate((p, a), (&mut from_q[..pixels], b), &weak, &mut worst);
+                    }
                 }
             }
             if worst.iter().all(|&w| w <= ORTHOGONAL) {
@@ -188,30 +195,46 @@ fn dot(a: &[Lanes], b: &[Lanes]) -> Lanes {
     sums
 }
 
-/// Makes two columns, each with its squared norm, orthogonal; `worst` is the greatest squared cosine that was between columns of which
-/// one matters.
+/// Whether a squared norm in one of two columns is not weak.
 #[inline(always)]
-fn rotate((p, a): (&mut [Lanes], &mut Lanes), (q, b): (&mut [Lanes], &mut Lanes), least: &Lanes, worst: &mut Lanes) {
+fn any_above(a: &Lanes, b: &Lanes, weak: &Lanes) -> bool {
+    let mut above = false;
+    for l in 0..GROUPS {
+        above |= a[l].max(b[l]) > weak[l];
+    }
+    above
+}
+
+/// Makes two columns, each with its squared norm, orthogonal, and the first the larger; `worst` is the greatest squared cosine that was
+/// between columns of which one is not weak.
+#[inline(always)]
+fn rotate((p, a): (&mut [Lanes], &mut Lanes), (q, b): (&mut [Lanes], &mut Lanes), weak: &Lanes, worst: &mut Lanes) {
     let c = dot(p, q);
-    let (mut cos, mut sin) = ([1f32; GROUPS], [0f32; GROUPS]);
+    // The new columns are x p + y q and z p + w q.
+    let [mut x, mut y, mut z, mut w] = [[0f32; GROUPS]; 4];
     for l in 0..GROUPS {
         let cosine = c[l] * c[l] / (a[l] * b[l]).max(f32::MIN_POSITIVE);
         let turns = cosine > 1e-12;
         let zeta = (b[l] - a[l]) / (2.0 * if turns { c[l] } else { 1.0 });
         let t = 1f32.copysign(zeta) / (zeta.abs() + (1.0 + zeta * zeta).sqrt());
         let t = if turns { t } else { 0.0 };
-        cos[l] = 1.0 / (1.0 + t * t).sqrt();
-        sin[l] = cos[l] * t;
-        let matters = a[l].max(b[l]) > 0.25 * least[l] * least[l];
+        let cos = 1.0 / (1.0 + t * t).sqrt();
+        let sin = cos * t;
+        let matters = a[l].max(b[l]) > weak[l];
         worst[l] = worst[l].max(if matters { cosine } else { 0.0 });
-        a[l] = (a[l] - t * c[l]).max(0.0);
-        b[l] += t * c[l];
+        let (of_p, of_q) = ((a[l] - t * c[l]).max(0.0), b[l] + t * c[l]);
+        let swaps = of_q > of_p;
+        (a[l], b[l]) = (of_p.max(of_q), of_p.min(of_q));
+        x[l] = if swaps { sin } else { cos };
+        y[l] = if swaps { cos } else { -sin };
+        z[l] = if swaps { cos } else { sin };
+        w[l] = if swaps { -sin } else { cos };
     }
     for (p, q) in p.iter_mut().zip(q) {
         for l in 0..GROUPS {
-            let (x, y) = (p[l], q[l]);
-            p[l] = cos[l] * x - sin[l] * y;
-            q[l] = sin[l] * x + cos[l] * y;
+            let (of_p, of_q) = (p[l], q[l]);
+            p[l] = x[l] * of_p + y[l] * of_q;
+            q[l] = z[l] * of_p + w[l] * of_q;
         }
     }
 }
