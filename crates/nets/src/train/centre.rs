@@ -8,6 +8,10 @@ use candle_core::{Device, Tensor, Var};
 const TAPS: usize = 9;
 /// A layer without ReLU that makes fewer channels makes a picture.
 const FEWEST_HIDDEN: usize = 16;
+/// What a nearly shut ReLU lets through, as part of the mean before it.
+const NEARLY_SHUT: f32 = 0.02;
+/// By how much of that mean it is opened.
+const RAISE: f32 = 0.1;
 
 /// The mean of what a layer is given, around which Muon's steps of its weight turn.
 ///
@@ -108,9 +112,36 @@ pub(super) fn open(conv: &Conv, means: &[f32], Variables { weight, bias }: Varia
     Ok(var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?)
 }
 
+/// Raises the biases of ReLUs that are nearly shut, before they are shut for everything: with what their layer is `given` on average, and
+/// with what they let through on average, `made`.
+///
+/// For normal values of mean μ < 0 and deviation s a ReLU lets through 0.02 |μ| on average at μ = −1.5 s, where it is open for 7 %. A tenth
+/// of |μ| at a time outpaces what shuts it. White noise can be taken out without the layers at a quarter of the size, and they are what shuts
+/// first; the low frequencies of a solver's iterate cannot. FastDVDnet (gray) at a constant 2e-3, PSNR of GAP in 20 calls on a validation clip
+/// (*car-shadow*): 24.5 dB after 800 steps, 22.5 after 4,400, when 97 % of the pixels were shut in such a layer.
+pub(super) fn hold_open(
+    conv: &Conv,
+    given: &[f32],
+    made: &[f32],
+    Variables { weight, bias }: Variables<'_>,
+) -> Result<()> {
+    let (Some(bias), true) = (bias, conv.inference().relu) else { return Ok(()) };
+    let mut biases: Vec<f32> = bias.to_vec1()?;
+    let responses = response(&weight.flatten_all()?.to_vec1::<f32>()?, given, conv.inference().groups);
+    for ((bias, response), made) in biases.iter_mut().zip(responses).zip(made) {
+        let mean = response + *bias;
+        if mean < 0.0 && *made < -NEARLY_SHUT * mean {
+            *bias -= RAISE * mean;
+        }
+    }
+    Ok(bias.set(&Tensor::from_vec(biases, bias.shape(), &Device::Cpu)?)?)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::NetworkConfig;
+    use crate::{Ffdnet, Network};
 
     #[test]
     fn the_gradient_around_the_mean_is_that_of_a_layer_without_one() {
@@ -133,6 +164,27 @@ mod tests {
         assert!(response(&step, &other, 1).iter().zip(beside).all(|(now, before)| (now - before).abs() < 1e-4));
         Centre { bias: None, means: vec![0.0; 2] }.keep(&mut step);
         assert!(step.iter().all(|w| w.is_finite()));
+    }
+
+    #[test]
+    fn only_what_is_nearly_shut_is_raised() {
+        let mut net = Ffdnet::random(NetworkConfig::ffdnet(1, 6, 4), 1).unwrap();
+        let vars = net.make_trainable().unwrap();
+        let convs = net.convs();
+        let var = |name: String| &vars.iter().find(|(var, _)| *var == name).unwrap().1;
+        let (weight, bias) = (var(convs[1].weight_name()), var(convs[1].bias_name()));
+        let plain = || bias.to_vec1::<f32>().unwrap();
+        // Given nothing, so that the bias is the mean.
+        bias.set(&Tensor::new(&[-2f32, -2.0, -2.0, 2.0, 0.0, -1.0], &Device::Cpu).unwrap()).unwrap();
+        let hold = |layer: usize| {
+            let made = [0.0, 0.03, 0.05, 0.0, 0.0, f32::NAN];
+            hold_open(convs[layer], &[0.0; 6], &made, Variables { weight, bias: Some(bias) }).unwrap();
+        };
+        hold(1);
+        assert_eq!(plain(), [-1.8, -1.8, -2.0, 2.0, 0.0, -1.0]);
+        // The last layer has no ReLU.
+        hold(3);
+        assert_eq!(plain(), [-1.8, -1.8, -2.0, 2.0, 0.0, -1.0]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The training loop's body.
 
 use super::adam::Adam;
-use super::centre::{Centre, Variables, open};
+use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
 use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
@@ -386,22 +386,29 @@ impl Trainer {
             let watched = self.watched(lesson)?;
             let conv = watched.network().convs()[i];
             let Some(means) = conv.input_means() else { continue };
-            let var = |number: usize| &self.vars[number].1;
-            open(conv, means, Variables { weight: var(weight), bias: bias.map(var) })?;
+            open(conv, means, self.variables(weight, bias))?;
         }
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         Ok(())
     }
 
-    /// What each layer is given on average, from what a lesson begins with.
+    /// What each layer is given on average, from what a lesson begins with, and what follows from it.
     fn find_centres(&mut self, lesson: &Lesson) -> Result<()> {
         let watched = self.watched(lesson)?;
-        for (conv, (weight, bias)) in watched.network().convs().into_iter().zip(self.idle.layers()) {
-            if let Some(means) = conv.input_means() {
-                self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
+        let convs = watched.network().convs();
+        for (i, (weight, bias)) in self.idle.layers().enumerate() {
+            let Some(means) = convs[i].input_means() else { continue };
+            // What a ReLU lets through is what the next layer is given.
+            if let Some(made) = convs.get(i + 1).and_then(|next| next.input_means()) {
+                hold_open(convs[i], means, made, self.variables(weight, bias))?;
             }
+            self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
         }
         Ok(())
+    }
+
+    fn variables(&self, weight: usize, bias: Option<usize>) -> Variables<'_> {
+        Variables { weight: &self.vars[weight].1, bias: bias.map(|bias| &self.vars[bias].1) }
     }
 
     /// The model after a pass of what a lesson begins with, in which it noted the means.
