@@ -64,8 +64,10 @@ struct Curve {
 const SIGMAS: &[f32] = &[50.0, 25.0, 12.0, 6.0];
 const TV: &[usize] = &[4, 8, 16, 40, 80];
 const NET: &[usize] = &[1, 2, 3, 5, 10];
-/// What the networks were trained for that know a solver's iterates.
+/// The networks that know a solver's iterates, and the σ they were trained for.
+const GRAY_FOR_ITERATES: &str = "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n";
 const GRAY_ITERATES: &[f32] = &[20.0, 18.0, 17.0, 16.0, 15.0, 14.0, 13.0, 12.0, 10.0, 9.0, 8.0, 7.0];
+const COLOR_FOR_ITERATES: &str = "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n";
 const COLOR_ITERATES: &[f32] = &[20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 8.0, 7.0];
 
 const GRAY: &[Curve] = &[
@@ -135,7 +137,7 @@ const GRAY: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n",
+        experiment: GRAY_FOR_ITERATES,
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
         refined: &[],
@@ -143,7 +145,7 @@ const GRAY: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates, then WNNM",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n",
+        experiment: GRAY_FOR_ITERATES,
         weights: None,
         sigmas: GRAY_ITERATES,
         refined: &[12.0, 8.0],
@@ -194,7 +196,7 @@ const COLOR: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n",
+        experiment: COLOR_FOR_ITERATES,
         weights: None,
         sigmas: &[20.0, 14.0, 10.0, 7.0],
         refined: &[],
@@ -202,7 +204,7 @@ const COLOR: &[Curve] = &[
     },
     Curve {
         name: "GAP-FastDVDnet for iterates, then WNNM",
-        experiment: "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n",
+        experiment: COLOR_FOR_ITERATES,
         weights: None,
         sigmas: COLOR_ITERATES,
         refined: &[12.0, 8.0],
@@ -371,16 +373,12 @@ fn experiment(curve: &Curve, budget: usize, data: &Path, shared: &Path) -> Strin
     if let Some(weights) = curve.weights {
         text += &format!("weights = '{}'\n", shared.join("weights").join(weights).display());
     }
-    let before = if curve.refined.is_empty() { budget } else { 1 };
-    for sigma in curve.sigmas {
-        text += &format!("[[stage]]\nsigma = {sigma}\niterations = {before}\n");
-    }
-    for sigma in curve.refined {
-        text += &format!("[[stage]]\nsigma = {sigma}\niterations = {budget}\n[stage.denoiser]\nkind = 'wnnm'\n");
-    }
-    if curve.sigmas.is_empty() {
-        text += &format!("[[stage]]\niterations = {budget}\n");
-    }
+    let stage = |sigmas: &[f32], iterations| format!("[[stage]]\nsigma = {sigmas:?}\niterations = {iterations}\n");
+    text += &match (curve.sigmas, curve.refined) {
+        ([], _) => format!("[[stage]]\niterations = {budget}\n"),
+        (sigmas, []) => stage(sigmas, budget),
+        (sigmas, refined) => stage(sigmas, 1) + &stage(refined, budget) + "[stage.denoiser]\nkind = 'wnnm'\n",
+    };
     text + "[output]\nframes = false\npreview = false\n"
 }
 

@@ -5,7 +5,7 @@ use crate::layers::Conv;
 use candle_core::{Device, Tensor, Var};
 
 /// Values of one filter.
-const TAPS: usize = 9;
+pub(super) const TAPS: usize = 9;
 /// A layer without ReLU that makes fewer channels makes a picture.
 const FEWEST_HIDDEN: usize = 16;
 /// What a nearly shut ReLU lets through, as part of the mean before it.

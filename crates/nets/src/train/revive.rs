@@ -8,14 +8,12 @@
 //! zeros out.
 
 use super::adam::Adam;
+use super::centre::TAPS;
 use crate::Result;
 use crate::layers::Conv;
 use candle_core::{Tensor, Var};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-
-/// Values of one filter.
-const TAPS: usize = 9;
 
 /// For how many steps in a row the channels of each layer have had no gradient.
 #[derive(Debug, Clone)]
