@@ -41,6 +41,7 @@ fn training(c: &mut Criterion) {
             batch: 16,
         },
         weights: None,
+        renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 75.0] }),
         iterates: None,
         training: TrainingConfig {

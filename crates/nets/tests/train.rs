@@ -34,6 +34,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
             batch: 2,
         },
         weights: None,
+        renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 50.0] }),
         iterates: None,
         training: TrainingConfig {
@@ -189,6 +190,42 @@ fn a_run_can_begin_with_weights() {
 }
 
 #[test]
+fn shut_layers_that_begin_anew_are_open_and_leave_the_network_what_it_was() {
+    let mut config = config(FASTDVDNET, 3, 1);
+    config.training.learning_rate = 1e-9;
+    let mut shut = trainer(&TrainConfig { seed: 9, ..config.clone() }).weights().unwrap();
+    let shut_by = "upc2.convblock.0.convblock.3.bias";
+    for (_, bias) in shut.iter_mut().filter(|(name, _)| name.ends_with(shut_by)) {
+        *bias = (bias.ones_like().unwrap() * -1e4).unwrap();
+    }
+    let begin = |renew: &[&str]| {
+        let config = TrainConfig {
+            weights: Some("shut".into()),
+            renew: renew.iter().map(|part| (*part).to_owned()).collect(),
+            ..config.clone()
+        };
+        let mut trainer = trainer(&config);
+        trainer.start_from(&shut).map(|()| trainer)
+    };
+    let mut before = begin(&[]).unwrap();
+    let mut after = begin(&["downc1", "upc2"]).unwrap();
+    run(&mut before, 1);
+    run(&mut after, 1);
+    assert!((before.validate().unwrap()[0].psnr_db - after.validate().unwrap()[0].psnr_db).abs() < 1e-4);
+    for (name, now) in after.weights().unwrap() {
+        let moved = (&now - &shut[&name]).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+        // Biases of other layers may be raised, as in any run.
+        if name.ends_with(".weight") {
+            assert_eq!(moved > 1e-3, name.contains("downc1") || name.contains("upc2"), "{name}: {moved}");
+        }
+        if name.ends_with(shut_by) {
+            assert!(now.min_all().unwrap().to_scalar::<f32>().unwrap() > -10.0);
+        }
+    }
+    assert!(matches!(begin(&["upc3"]), Err(Error::Setting { key: "renew", .. })));
+}
+
+#[test]
 fn noise_or_iterates_but_not_both() {
     let good = on_iterates(config(FFDNET, 1, 1));
     let key = |change: fn(&mut TrainConfig)| {
@@ -263,6 +300,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
     trainer(&config).save(&path).unwrap();
     let other = TrainConfig {
         weights: None,
+        renew: vec![],
         noise: Some(NoiseConfig { sigma: [5.0, 10.0] }),
         iterates: None,
         ..config.clone()
@@ -331,13 +369,14 @@ fn exported_weights_load_as_the_network() {
 #[test]
 fn every_setting_has_its_range() {
     type Change = fn(&mut TrainConfig);
-    let changes: [(&str, Change); 13] = [
+    let changes: [(&str, Change); 14] = [
         ("name", |c| c.name = "../x".into()),
         ("data", |c| (c.data.video, c.data.photos) = (None, None)),
         ("data.photo_share", |c| c.data.photo_share = f64::NAN),
         ("data.patch", |c| c.data.patch = 30),
         ("data.frames", |c| c.data.frames = 0),
         ("data.batch", |c| c.data.batch = 0),
+        ("renew", |c| c.renew = vec!["upc2".into()]),
         ("noise.sigma", |c| c.noise = Some(NoiseConfig { sigma: [30.0, 300.0] })),
         ("training.steps", |c| c.training.steps = 0),
         ("training.learning_rate", |c| c.training.learning_rate = -1.0),

@@ -93,9 +93,15 @@ pub(super) struct Variables<'a> {
 ///
 /// # References
 /// Mishkin, Matas, *All you need is a good init*, ICLR 2016 (means and variances of a first batch; the variances brought nothing here).
-pub(super) fn open(conv: &Conv, means: &[f32], Variables { weight, bias }: Variables<'_>) -> Result<()> {
+/// Of layers that are `renewed` among others that are not, every one without a ReLU is silent.
+pub(super) fn open(
+    conv: &Conv,
+    means: &[f32],
+    Variables { weight, bias }: Variables<'_>,
+    renewed: bool,
+) -> Result<()> {
     let mut values: Vec<f32> = weight.flatten_all()?.to_vec1()?;
-    if !conv.inference().relu && weight.dims()[0] < FEWEST_HIDDEN {
+    if !conv.inference().relu && (renewed || weight.dims()[0] < FEWEST_HIDDEN) {
         values.fill(0.0);
         weight.set(&weight.zeros_like()?)?;
     }

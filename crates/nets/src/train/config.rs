@@ -23,6 +23,10 @@ pub struct TrainConfig {
     /// Weights to begin with, a file or `bundled:NAME`; random ones without.
     #[serde(default)]
     pub weights: Option<PathBuf>,
+    /// Layers that begin anew instead, by a part of their names. Those without a ReLU begin silent, so that a network whose layers were
+    /// shut is at first what it was. Default none.
+    #[serde(default)]
+    pub renew: Vec<String>,
     /// The noise put on its input; this or `iterates`.
     #[serde(default)]
     pub noise: Option<NoiseConfig>,
@@ -292,6 +296,8 @@ impl TrainConfig {
         check(patch, "data.patch", data.patch, "a multiple of 4 from 4 to 1024")?;
         check((1..=64).contains(&data.frames), "data.frames", data.frames, "1 to 64")?;
         check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
+        let anew = self.renew.is_empty() || self.weights.is_some();
+        check(anew, "renew", format_args!("{:?}", self.renew), "only with weights: without them all layers begin anew")?;
         match (&self.noise, &self.iterates) {
             (Some(NoiseConfig { sigma: [low, high] }), None) => {
                 let ordered = level(*low) && level(*high) && low <= high;
@@ -346,6 +352,11 @@ impl TrainConfig {
         check(density, "iterates.density", format_args!("[{thin}, {dense}]"), legal)?;
         check((0.0..=0.5).contains(holes), "iterates.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(gray_masks), "iterates.gray_masks", gray_masks, "0 to 1")
+    }
+
+    /// Whether a layer, or a variable of one, begins anew.
+    pub(super) fn renews(&self, name: &str) -> bool {
+        self.renew.iter().any(|part| name.contains(&**part))
     }
 
     /// The learning rate of a step, counted from 0: a linear rise, then half a cosine.

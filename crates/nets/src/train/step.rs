@@ -249,12 +249,20 @@ impl Trainer {
         Ok(Self { config, data, model, vars, adam, average, idle, random: true, step: 0 })
     }
 
-    /// Begins with these weights instead of random ones.
+    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
     ///
     /// # Errors
-    /// [`Error::State`] when names or shapes are not those of the network.
+    /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
     pub fn start_from(&mut self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
+        let random = self.model.network().state();
+        if let Some(part) = self.config.renew.iter().find(|part| !random.keys().any(|name| name.contains(&***part))) {
+            let legal = "parts of the names of the network's layers".to_owned();
+            return Err(Error::Setting { key: "renew", value: part.clone(), legal });
+        }
         self.model.network_mut().set_state(weights)?;
+        let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
+        let state = self.model.network().state().into_iter().chain(renewed).collect();
+        self.model.network_mut().set_state(&state)?;
         self.vars = self.model.network_mut().make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
@@ -358,7 +366,7 @@ impl Trainer {
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
-        if self.step == 0 && self.random {
+        if self.step == 0 {
             self.open_layers(&lessons[0])?;
         }
         if self.config.training.optimizer == Optimizer::Muon && self.step.is_multiple_of(CENTRE_EVERY) {
@@ -380,13 +388,17 @@ impl Trainer {
         Ok(StepReport { step: self.step, loss, learning_rate, gradient_norm, revived })
     }
 
-    /// Random weights to begin with, layer after layer, as each changes what the next is given.
+    /// Opens layers with random weights, one after another, as each changes what the next is given.
     fn open_layers(&mut self, lesson: &Lesson) -> Result<()> {
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
+            let renewed = self.config.renews(&self.vars[weight].0);
+            if !(self.random || renewed) {
+                continue;
+            }
             let watched = self.watched(lesson)?;
             let conv = watched.network().convs()[i];
             let Some(means) = conv.input_means() else { continue };
-            open(conv, means, self.variables(weight, bias))?;
+            open(conv, means, self.variables(weight, bias), renewed)?;
         }
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         Ok(())
