@@ -391,10 +391,10 @@ impl Trainer {
     /// Opens layers with random weights, one after another, as each changes what the next is given.
     fn open_layers(&mut self, lesson: &Lesson) -> Result<()> {
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
-            let renewed = self.config.renews(&self.vars[weight].0);
-            if !(self.random || renewed) {
+            if !self.began_anew(weight) {
                 continue;
             }
+            let renewed = !self.random;
             let watched = self.watched(lesson)?;
             let conv = watched.network().convs()[i];
             let Some(means) = conv.input_means() else { continue };
@@ -411,12 +411,17 @@ impl Trainer {
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
             let Some(means) = convs[i].input_means() else { continue };
             // What a ReLU lets through is what the next layer is given.
-            if let Some(made) = convs.get(i + 1).and_then(|next| next.input_means()) {
+            if let Some(made) = convs.get(i + 1).and_then(|next| next.input_means()).filter(|_| self.began_anew(weight)) {
                 hold_open(convs[i], means, made, self.variables(weight, bias))?;
             }
             self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
         }
         Ok(())
+    }
+
+    /// Whether the layer of this weight began with random values. Others may have ReLUs that are meant to be shut.
+    fn began_anew(&self, weight: usize) -> bool {
+        self.random || self.config.renews(&self.vars[weight].0)
     }
 
     fn variables(&self, weight: usize, bias: Option<usize>) -> Variables<'_> {
