@@ -89,17 +89,11 @@ pub(super) struct Variables<'a> {
 /// layer without batch norm, the larger its mean beside what varies, and the more ReLUs would be shut, or open, for everything.
 /// The last layer makes nothing at all, so that the network begins as its residual connections, and what it found at random need not be
 /// unlearned. FastDVDnet (gray, 800 steps at 2e-3), PSNR at σ = 25 on the validation clips: 28.85 dB with He's weights as they are,
-/// 28.92 with half-open ReLUs, 29.08 with both.
+/// 28.92 with half-open ReLUs, 29.08 with both. Of layers that are `renewed` among others every one without a ReLU is silent.
 ///
 /// # References
 /// Mishkin, Matas, *All you need is a good init*, ICLR 2016 (means and variances of a first batch; the variances brought nothing here).
-/// Of layers that are `renewed` among others that are not, every one without a ReLU is silent.
-pub(super) fn open(
-    conv: &Conv,
-    means: &[f32],
-    Variables { weight, bias }: Variables<'_>,
-    renewed: bool,
-) -> Result<()> {
+pub(super) fn open(conv: &Conv, means: &[f32], Variables { weight, bias }: Variables<'_>, renewed: bool) -> Result<()> {
     let mut values: Vec<f32> = weight.flatten_all()?.to_vec1()?;
     if !conv.inference().relu && (renewed || weight.dims()[0] < FEWEST_HIDDEN) {
         values.fill(0.0);

@@ -296,8 +296,8 @@ impl TrainConfig {
         check(patch, "data.patch", data.patch, "a multiple of 4 from 4 to 1024")?;
         check((1..=64).contains(&data.frames), "data.frames", data.frames, "1 to 64")?;
         check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
-        let anew = self.renew.is_empty() || self.weights.is_some();
-        check(anew, "renew", format_args!("{:?}", self.renew), "only with weights: without them all layers begin anew")?;
+        let beside = self.renew.is_empty() || self.weights.is_some();
+        check(beside, "renew", self.renew.join(", "), "only with weights: without them all layers begin anew")?;
         match (&self.noise, &self.iterates) {
             (Some(NoiseConfig { sigma: [low, high] }), None) => {
                 let ordered = level(*low) && level(*high) && low <= high;
