@@ -55,7 +55,8 @@ impl Args {
         let start = config.weights.as_ref().map(|path| data::weights(path, &self.config)).transpose()?;
         let mut trainer = Trainer::new(config, data)?;
         if let Some(weights) = start {
-            trainer.start_from(&weights.into_tensors()).context("weights")?;
+            let place = || format!("{}: beginning with weights", self.config.display());
+            trainer.start_from(&weights.into_tensors()).with_context(place)?;
         }
         outln!("{}, {} parameters", trainer.describe(), trainer.parameter_count());
         if self.resume {
