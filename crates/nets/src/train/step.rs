@@ -411,8 +411,8 @@ impl Trainer {
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
             let Some(means) = convs[i].input_means() else { continue };
             // What a ReLU lets through is what the next layer is given.
-            if let Some(made) = convs.get(i + 1).and_then(|next| next.input_means()).filter(|_| self.began_anew(weight))
-            {
+            let made = convs.get(i + 1).and_then(|next| next.input_means());
+            if let (Some(made), true) = (made, self.began_anew(weight)) {
                 hold_open(convs[i], means, made, self.variables(weight, bias))?;
             }
             self.adam.set_centre(weight, Centre { bias, means: means.to_vec() });
