@@ -1,4 +1,4 @@
-//! The demosaicers: golden outputs, flat images, exact linear ramps, and the samples that must survive.
+//! The demosaicers: golden outputs, flat images, exact linear ramps, the samples that must survive, and the mosaic operator.
 
 use ndarray::{Array2, Array3, Array4, Axis, s};
 use ndarray_npy::NpzReader;
@@ -59,6 +59,45 @@ fn flat_images_stay_flat_and_samples_stay_what_they_were() {
     }
 }
 
+/// Each channel a ramp of its own: every filter here takes what is linear as it is, away from the border.
+#[test]
+fn linear_ramps_are_exact() {
+    let (height, width) = (34, 41);
+    let ramps = Array4::from_shape_fn((1, 3, height, width), |(_, k, r, c)| {
+        let [down, right] = [[0.004, 0.002], [-0.003, 0.005], [0.001, -0.006]][k];
+        0.5 + down * r as f32 + right * c as f32
+    });
+    for (name, mut method) in demosaicers() {
+        for cfa in CfaPattern::ALL {
+            let mut mosaic = Array3::zeros((1, height, width));
+            mosaic_into(cfa, ramps.view(), mosaic.view_mut());
+            let rgb = demosaic(&mut *method, cfa, &mosaic);
+            let border = if name == "menon2007" { 8 } else { 2 };
+            let inner = s![.., .., border..height - border, border..width - border];
+            let worst = (&rgb.slice(inner) - &ramps.slice(inner)).fold(0f32, |m, d| m.max(d.abs()));
+            assert!(worst < 1e-6, "{name} {cfa}: {worst}");
+        }
+    }
+}
+
+/// More rows than one task takes, and more tasks than threads.
+#[test]
+fn the_thread_count_does_not_change_a_bit() {
+    let mosaic = uniform((2, 150, 37), 4);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| demosaicers().map(|(_, mut method)| demosaic(&mut *method, CfaPattern::Gbrg, &mosaic)))
+    };
+    assert_eq!(run(1), run(2));
+    assert_eq!(run(1), run(3));
+}
+
+#[test]
+fn a_demosaicer_has_a_name_and_can_go_to_another_thread() {
+    let names = demosaicers().map(|(_, method)| std::thread::spawn(move || method.name().to_owned()).join().unwrap());
+    assert_eq!(names, ["bilinear", "malvar", "menon"]);
+}
+
 /// Shifting the pattern by a row or a column is the same as shifting the image.
 #[test]
 fn the_four_patterns_are_one_pattern_shifted() {
@@ -94,6 +133,16 @@ fn the_mosaic_and_its_adjoint_belong_together() {
         mosaic_adjoint_into(cfa, m.view(), tty.view_mut());
         let (left, right) = ((&tx * &m).sum(), (&rgb * &tty).sum());
         assert!((left - right).abs() < 1e-4 * left.abs(), "{left} {right}");
+        // Both by their definition, also in arrays that are not contiguous.
+        for ((t, r, c), &v) in tx.indexed_iter() {
+            let seen = cfa.color_at(r, c) as usize;
+            assert_eq!(v, rgb[[t, seen, r, c]]);
+            assert!((0..3).all(|k| tty[[t, k, r, c]] == if k == seen { m[[t, r, c]] } else { 0.0 }));
+        }
+        let turned = rgb.view().permuted_axes([0, 1, 3, 2]).as_standard_layout().into_owned();
+        let mut again = Array3::from_elem((2, 6, 7), f32::NAN);
+        mosaic_into(cfa, turned.view().permuted_axes([0, 1, 3, 2]), again.view_mut().permuted_axes([0, 2, 1]));
+        assert_eq!(again.permuted_axes([0, 2, 1]), tx);
         // A sub-lattice has one color.
         let red = cfa.red_site();
         let lattice = sub_lattice(tx.view(), red.0, red.1);

@@ -11,6 +11,10 @@ use ndarray::{ArrayView2, ArrayView3, ArrayViewMut3, ArrayViewMut4, Axis};
 pub struct Bilinear;
 
 impl Demosaicer for Bilinear {
+    fn name(&self) -> &str {
+        "bilinear"
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,

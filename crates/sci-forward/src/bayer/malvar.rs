@@ -1,6 +1,6 @@
 //! Gradient-corrected linear interpolation.
 
-use super::rows::{PAD, Window, mirror};
+use super::rows::{PAD, Window, copy_every_other, mirror};
 use super::{CfaPattern, Color, Demosaicer, check_sizes};
 use crate::BoxError;
 use multiversion::multiversion;
@@ -28,6 +28,10 @@ const BAND: usize = 32;
 pub struct Malvar;
 
 impl Demosaicer for Malvar {
+    fn name(&self) -> &str {
+        "malvar"
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,
@@ -130,19 +134,9 @@ fn demosaic_band(cfa: CfaPattern, mosaic: ArrayView2<'_, f32>, first: usize, mut
                 _ => [(color, sample), (Color::Green, &green[..]), (other, &opposite[..])],
             };
             for (channel, source) in sources {
-                let mut row = rgb.slice_mut(s![channel as usize, r, ..]);
-                match row.as_slice_mut() {
-                    Some(row) => copy_every_other(row, source, column),
-                    None => (column..width).step_by(2).for_each(|c| row[c] = source[c]),
-                }
+                copy_every_other(rgb.slice_mut(s![channel as usize, r, ..]), source.into(), column);
             }
         }
-    }
-}
-
-fn copy_every_other(to: &mut [f32], from: &[f32], first: usize) {
-    for (to, from) in to[first..].iter_mut().step_by(2).zip(from[first..].iter().step_by(2)) {
-        *to = *from;
     }
 }
 

@@ -20,12 +20,16 @@ pub use malvar::Malvar;
 pub use menon::Menon;
 pub use mosaic::{mosaic_adjoint_into, mosaic_into, sub_lattice, sub_lattice_mut};
 pub use pattern::{CfaPattern, Color};
+pub use rows::mirror;
 
 use crate::BoxError;
 use ndarray::{ArrayView3, ArrayViewMut4};
 
 /// Fills in the two colors that each pixel of a mosaic video did not see.
-pub trait Demosaicer {
+pub trait Demosaicer: Send {
+    /// What errors and records call it.
+    fn name(&self) -> &str;
+
     /// Writes the RGB video `[T, 3, H, W]` of a `mosaic` `[T, H, W]` taken through `cfa`.
     ///
     /// # Errors
@@ -39,6 +43,10 @@ pub trait Demosaicer {
 }
 
 impl<M: Demosaicer + ?Sized> Demosaicer for &mut M {
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,
@@ -50,6 +58,10 @@ impl<M: Demosaicer + ?Sized> Demosaicer for &mut M {
 }
 
 impl<M: Demosaicer + ?Sized> Demosaicer for Box<M> {
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,

@@ -1,30 +1,69 @@
 //! Mirrored access to the rows of a frame, shared by the demosaicers.
 
-use ndarray::ArrayView2;
+use multiversion::multiversion;
+use ndarray::{ArrayView1, ArrayView2, ArrayViewMut1, s};
 
 /// The columns that a row is mirrored by on each side.
 pub(super) const PAD: usize = 2;
 
 /// The index within `0..n` that `i` mirrors to, the edge not repeated (−1 → 1, n → n − 2): its parity stays, and so its color.
-/// `n` is at least 2.
-pub(super) fn mirror(i: isize, n: usize) -> usize {
+///
+/// # Panics
+/// If `n` is less than 2.
+///
+/// ```
+/// use sci_forward::bayer::mirror;
+/// assert_eq!([-2, -1, 0, 3, 4, 5].map(|i| mirror(i, 4)), [2, 1, 0, 3, 2, 1]);
+/// ```
+pub fn mirror(i: isize, n: usize) -> usize {
+    assert!(n >= 2, "{n} places cannot be mirrored without repeating the edge");
+    if let Ok(inside) = usize::try_from(i)
+        && inside < n
+    {
+        return inside;
+    }
     let period = 2 * (n as isize - 1);
     let i = i.rem_euclid(period);
     (if i < n as isize { i } else { period - i }) as usize
 }
 
 /// Writes row `r` (which may lie outside the image) to `row`, with [`PAD`] mirrored columns on each side.
-pub(super) fn padded_row(image: ArrayView2<'_, f32>, r: isize, row: &mut [f32]) {
+fn padded_row(image: ArrayView2<'_, f32>, r: isize, row: &mut [f32]) {
     let (height, width) = image.dim();
-    let source = image.row(mirror(r, height).min(height - 1));
-    let (left, rest) = row.split_at_mut(PAD);
-    let (middle, right) = rest.split_at_mut(width);
-    middle.iter_mut().zip(source).for_each(|(to, v)| *to = *v);
-    for (k, v) in left.iter_mut().enumerate() {
-        *v = source[mirror(k as isize - PAD as isize, width)];
+    row[PAD..][..width].iter_mut().zip(image.row(mirror(r, height))).for_each(|(to, v)| *to = *v);
+    mirror_columns(row);
+}
+
+/// Fills the [`PAD`] columns on each side of a row by mirroring those between.
+pub(super) fn mirror_columns(row: &mut [f32]) {
+    let width = row.len() - 2 * PAD;
+    for k in 1..=PAD {
+        row[PAD - k] = row[PAD + mirror(-(k as isize), width)];
+        row[PAD + width + k - 1] = row[PAD + mirror((width + k - 1) as isize, width)];
     }
-    for (k, v) in right.iter_mut().enumerate() {
-        *v = source[mirror((width + k) as isize, width)];
+}
+
+/// Copies columns `first`, `first + 2`, …; `first` is 0 or 1.
+pub(super) fn copy_every_other(mut to: ArrayViewMut1<'_, f32>, from: ArrayView1<'_, f32>, first: usize) {
+    match (to.as_slice_mut(), from.as_slice()) {
+        (Some(to), Some(from)) if first == 0 => merge::<0>(to, from),
+        (Some(to), Some(from)) => merge::<1>(to, from),
+        _ => to.slice_mut(s![first..;2]).assign(&from.slice(s![first..;2])),
+    }
+}
+
+/// [`copy_every_other`] by whole vectors of both rows.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn merge<const FIRST: usize>(to: &mut [f32], from: &[f32]) {
+    const LANES: usize = 16;
+    let ((to, to_rest), (from, from_rest)) = (to.as_chunks_mut::<LANES>(), from.as_chunks::<LANES>());
+    for (to, from) in to.iter_mut().zip(from) {
+        for lane in 0..LANES {
+            to[lane] = if lane % 2 == FIRST { from[lane] } else { to[lane] };
+        }
+    }
+    for (to, from) in to_rest.iter_mut().zip(from_rest).skip(FIRST).step_by(2) {
+        *to = *from;
     }
 }
 
