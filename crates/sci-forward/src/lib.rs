@@ -11,20 +11,32 @@
 //!
 //! ```
 //! use ndarray::Array3;
-//! use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+//! use sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+//! use std::sync::Arc;
 //!
 //! let shape = VideoShape { frames: 8, height: 6, width: 5 };
-//! let operator = MaskOperator::new(MaskStack::random(shape, 0.5, 0)?);
-//! let y = operator.forward(Array3::from_elem(shape.dim(), 0.5).view());
-//! assert_eq!(y.dim(), (6, 5));
-//! # Ok::<(), sci_forward::MaskError>(())
+//! let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 0)?));
+//! // Frame t has the brightness t / 10: y is the sum of those that a pixel is open for.
+//! let video = Array3::from_shape_fn(shape.dim(), |(t, ..)| t as f32 / 10.0);
+//! let y = h.forward(video.view());
+//! let open = h.source().view();
+//! let expected: f32 = (0..8).map(|t| open[[t, 2, 3]] * t as f32 / 10.0).sum();
+//! assert_eq!(y[[2, 3]], expected);
+//!
+//! // Operator and image together, checked once. The true video explains it.
+//! let measurement = Measurement::new(h, y)?;
+//! let residual = measurement.residual(video.insert_axis(ndarray::Axis(1)).view())?;
+//! assert!(residual.iter().all(|r| *r == 0.0));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
 //! # References
 //! Wu et al., *Adaptive Deep PnP Algorithm for Video Snapshot Compressive Imaging*, section 2.
 
 pub mod bayer;
-mod mask;
+mod masked;
+mod masks;
+mod measurement;
 pub mod metrics;
 mod noise;
 mod operator;
@@ -32,9 +44,11 @@ mod operator;
 pub mod testing;
 
 pub use bayer::{CfaPattern, Demosaicer};
-pub use mask::{MaskError, MaskStack, held_in};
+pub use masked::{BinaryMasks, Gained, MaskOperator, MaskSource, ShiftingMasks};
+pub use masks::{MaskError, MaskStack};
+pub use measurement::{Measurement, MeasurementError};
 pub use noise::{Noise, NoiseError};
-pub use operator::{DataStep, MaskOperator, Progress, SensingOperator};
+pub use operator::{Restricted, SensingOperator};
 
 /// The error type at the seams where a plug-in (a denoiser, a demosaicer, an observer) reports to code that cannot know its errors.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync + 'static>;

@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView2};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, Normal, Poisson};
+use rand_distr::{Distribution, Poisson, StandardNormal};
 
 /// A noise parameter outside its range.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -17,81 +17,141 @@ pub enum NoiseError {
     Photons(f64),
 }
 
-/// The noise of a simulated measurement. `y` is in units of a frame's full scale, so it reaches `Σ_t C_t`.
+/// The noise of a sensor: shot noise of the light, then read noise of the electronics.
+///
+/// ```text
+/// y' = Poisson(photons · max(y, 0)) / photons + N(0, sigma²)
+/// ```
+///
+/// `y` is in units of a frame's full scale, so it reaches `Σ_t C_t`. Without `photons` there is no shot noise, and `y' = y + N`.
+///
+/// ```
+/// use ndarray::Array2;
+/// use sci_forward::Noise;
+///
+/// let y = Array2::from_elem((64, 64), 2.0);
+/// let noisy = Noise::new(Some(100.0), 0.1)?.apply(y.view(), 7);
+/// // The variances add up: 2 / 100 + 0.1².
+/// assert!((noisy.mean().unwrap() - 2.0).abs() < 0.02 && (noisy.var(0.0) - 0.03).abs() < 0.003);
+/// # Ok::<(), sci_forward::NoiseError>(())
+/// ```
+///
+/// # References
+/// Foi et al., *Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data*, 2008.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub enum Noise {
-    /// `y + N(0, sigma²)`.
-    Gaussian {
-        /// Standard deviation, in the unit of `y`.
-        sigma: f64,
-    },
-    /// `Poisson(photons · max(y, 0)) / photons`: shot noise of a sensor that counts `photons` per unit of `y`.
-    Poisson {
-        /// Photons that a pixel counts when `y` = 1.
-        photons: f64,
-    },
+pub struct Noise {
+    photons: Option<f64>,
+    sigma: f64,
 }
 
 impl Noise {
-    /// The noisy measurement `[H, W]`, the same for the same `seed`.
+    /// Noise of a sensor that counts `photons` per unit of `y`, in (0, 1e9] (`None`: no shot noise), and whose read noise has
+    /// the standard deviation `sigma` ≥ 0 in the unit of `y`.
     ///
     /// # Errors
     /// [`NoiseError`] for a parameter outside its range.
-    ///
-    /// ```
-    /// use ndarray::Array2;
-    /// use sci_forward::Noise;
-    /// let y = Noise::Gaussian { sigma: 0.1 }.apply(Array2::from_elem((4, 4), 2.0).view(), 7)?;
-    /// assert!(y.iter().all(|v| (v - 2.0).abs() < 1.0));
-    /// # Ok::<(), sci_forward::NoiseError>(())
-    /// ```
-    pub fn apply(self, y: ArrayView2<'_, f32>, seed: u64) -> Result<Array2<f32>, NoiseError> {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        match self {
-            Self::Gaussian { sigma } => {
-                if !(sigma.is_finite() && sigma >= 0.0) {
-                    return Err(NoiseError::Sigma(sigma));
-                }
-                let normal = Normal::new(0.0, sigma).map_err(|_| NoiseError::Sigma(sigma))?;
-                Ok(y.mapv(|v| (f64::from(v) + normal.sample(&mut rng)) as f32))
-            }
-            Self::Poisson { photons } => {
-                if !(photons > 0.0 && photons <= 1e9) {
-                    return Err(NoiseError::Photons(photons));
-                }
-                Ok(y.mapv(|v| match Poisson::new(photons * f64::from(v)) {
-                    Ok(count) => (count.sample(&mut rng) / photons) as f32,
-                    // No light (or a negative reading): no photons, no noise.
-                    Err(_) => 0.0,
-                }))
-            }
+    pub fn new(photons: Option<f64>, sigma: f64) -> Result<Self, NoiseError> {
+        if let Some(photons) = photons.filter(|photons| !(*photons > 0.0 && *photons <= 1e9)) {
+            return Err(NoiseError::Photons(photons));
         }
+        if !(sigma.is_finite() && sigma >= 0.0) {
+            return Err(NoiseError::Sigma(sigma));
+        }
+        Ok(Self { photons, sigma })
     }
+
+    /// The noisy measurement `[H, W]`, the same for the same `seed`.
+    ///
+    /// Shot noise draws from `seed` and read noise from `seed + 1`: one of them alone is what it is in the sum of both.
+    pub fn apply(&self, y: ArrayView2<'_, f32>, seed: u64) -> Array2<f32> {
+        let mut noisy = y.to_owned();
+        if let Some(photons) = self.photons {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            noisy.mapv_inplace(|v| (count(photons * f64::from(v), &mut rng) / photons) as f32);
+        }
+        if self.sigma > 0.0 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed.wrapping_add(1));
+            noisy.mapv_inplace(|v| (f64::from(v) + self.sigma * normal(&mut rng)) as f32);
+        }
+        noisy
+    }
+}
+
+/// From so many photons on, counts are drawn from a normal distribution: the skewness 1/√λ that it lacks is below 1e-4, while the
+/// exact sampler loses its digits and ends at 1.8e19.
+const MANY: f64 = 1e9;
+
+/// A photon count of mean `lambda`: 0 if there is no light, or a negative reading.
+fn count(lambda: f64, rng: &mut ChaCha8Rng) -> f64 {
+    if lambda <= 0.0 {
+        return 0.0;
+    }
+    if lambda >= MANY {
+        return lambda + lambda.sqrt() * normal(rng);
+    }
+    // What is left is NaN, which stays what it is.
+    Poisson::new(lambda).map_or(lambda, |poisson| poisson.sample(rng))
+}
+
+fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    StandardNormal.sample(rng)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn mean_and_variance(noise: Noise) -> (f64, f64) {
-        let y = noise.apply(Array2::from_elem((200, 200), 2.0).view(), 3).unwrap().mapv(f64::from);
+    fn mean_and_variance(noise: Noise, level: f32) -> (f64, f64) {
+        let y = noise.apply(Array2::from_elem((200, 200), level).view(), 3).mapv(f64::from);
         (y.mean().unwrap(), y.var(0.0))
     }
 
     #[test]
     fn noise_has_the_mean_and_variance_of_its_model() {
-        let (mean, variance) = mean_and_variance(Noise::Gaussian { sigma: 0.2 });
-        assert!((mean - 2.0).abs() < 0.005 && (variance - 0.04).abs() < 0.002, "{mean} {variance}");
-        let (mean, variance) = mean_and_variance(Noise::Poisson { photons: 50.0 });
-        assert!((mean - 2.0).abs() < 0.005 && (variance - 2.0 / 50.0).abs() < 0.002, "{mean} {variance}");
+        for (photons, sigma) in [(None, 0.2), (Some(50.0), 0.0), (Some(50.0), 0.2)] {
+            let (mean, variance) = mean_and_variance(Noise::new(photons, sigma).unwrap(), 2.0);
+            let expected = photons.map_or(0.0, |photons| 2.0 / photons) + sigma * sigma;
+            assert!((mean - 2.0).abs() < 0.005, "{photons:?} {sigma}: {mean}");
+            assert!((variance - expected).abs() < 0.03 * expected, "{photons:?} {sigma}: {variance} is not {expected}");
+        }
+    }
+
+    /// Both sides of the number of photons at which the sampler changes.
+    #[test]
+    fn bright_light_has_shot_noise_of_the_same_law() {
+        for level in [0.9 * MANY, 1.1 * MANY, 1e15] {
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let counts = Array2::from_shape_simple_fn((200, 200), || count(level, &mut rng) - level);
+            let (mean, variance) = (counts.mean().unwrap() / level.sqrt(), counts.var(0.0) / level);
+            assert!(mean.abs() < 0.02 && (variance - 1.0).abs() < 0.03, "{level}: {mean}, {variance}");
+        }
+    }
+
+    #[test]
+    fn light_beyond_the_samplers_range_stays_light() {
+        let y = Array2::from_elem((2, 2), 2e10);
+        let noisy = Noise::new(Some(1e9), 0.0).unwrap().apply(y.view(), 0);
+        assert!(noisy.iter().all(|v| (v / 2e10 - 1.0).abs() < 1e-6), "{noisy}");
     }
 
     #[test]
     fn darkness_has_no_shot_noise_and_bad_parameters_are_refused() {
-        let dark = Array2::zeros((2, 2));
-        assert_eq!(Noise::Poisson { photons: 10.0 }.apply(dark.view(), 0).unwrap(), dark);
-        assert_eq!(Noise::Poisson { photons: 0.0 }.apply(dark.view(), 0), Err(NoiseError::Photons(0.0)));
-        assert_eq!(Noise::Gaussian { sigma: -1.0 }.apply(dark.view(), 0), Err(NoiseError::Sigma(-1.0)));
+        let dark = ndarray::array![[0.0, -1.0]];
+        assert_eq!(Noise::new(Some(10.0), 0.0).unwrap().apply(dark.view(), 0), Array2::<f32>::zeros((1, 2)));
+        assert_eq!(Noise::new(Some(0.0), 0.0), Err(NoiseError::Photons(0.0)));
+        assert_eq!(Noise::new(Some(2e9), 0.0), Err(NoiseError::Photons(2e9)));
+        assert_eq!(Noise::new(None, -1.0), Err(NoiseError::Sigma(-1.0)));
+        assert!(Noise::new(None, f64::NAN).is_err());
+    }
+
+    #[test]
+    fn the_two_parts_are_drawn_apart() {
+        let y = Array2::from_elem((8, 8), 1.0f32);
+        let apply = |photons, sigma| Noise::new(photons, sigma).unwrap().apply(y.view(), 5);
+        let shot = apply(Some(40.0), 0.0);
+        let read = apply(None, 0.1) - &y;
+        let both = apply(Some(40.0), 0.1);
+        assert!((&both - &shot - &read).iter().all(|d| d.abs() < 1e-6));
+        assert_ne!(Noise::new(None, 0.1).unwrap().apply(y.view(), 6), apply(None, 0.1));
     }
 }

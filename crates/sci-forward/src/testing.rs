@@ -1,7 +1,9 @@
 //! Seeded inputs and measures for tests of operators and solvers (feature `testing`).
 
-use crate::{MaskStack, SensingOperator, VideoShape};
-use ndarray::{Array, Array3, Dimension, ShapeBuilder, Zip};
+use crate::{MaskOperator, MaskSource, MaskStack, SensingOperator, VideoShape};
+use ndarray::{
+    Array, Array3, ArrayView2, ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis, Dimension, ShapeBuilder, Zip, s,
+};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
@@ -59,6 +61,79 @@ pub fn adjoint_gap(operator: &dyn SensingOperator, seed: u64) -> f64 {
     let right = Zip::from(&x).and(&hty).fold(0.0, |s, &a, &b| s + f64::from(a) * f64::from(b));
     let scale = (norm(hx.iter()) * norm(y.iter())).max(norm(x.iter()) * norm(hty.iter()));
     (left - right).abs() / scale.max(f64::MIN_POSITIVE)
+}
+
+/// Holds a source of masks to its promises: values in 0 to 1e9, the same in pieces as in a whole row.
+///
+/// # Panics
+/// If a promise is broken.
+///
+/// ```
+/// use sci_forward::{MaskStack, VideoShape, testing::check_source};
+/// check_source(&MaskStack::random(VideoShape { frames: 2, height: 3, width: 70 }, 0.5, 0)?);
+/// # Ok::<(), sci_forward::MaskError>(())
+/// ```
+pub fn check_source(source: &dyn MaskSource) {
+    let (frames, height, width) = source.shape().dim();
+    let (mut whole, mut pieces) = (vec![f32::NAN; width], vec![f32::NAN; width]);
+    for (frame, row) in (0..frames).flat_map(|t| (0..height).map(move |row| (t, row))) {
+        source.fill(frame, row, 0, &mut whole);
+        let outside = whole.iter().position(|v| !(0.0..=1e9).contains(v));
+        assert_eq!(outside.map(|column| whole[column]), None, "frame {frame}, row {row}");
+        // Pieces of every length from 1 on.
+        let mut start = 0;
+        for length in 1.. {
+            let end = (start + length).min(width);
+            source.fill(frame, row, start, &mut pieces[start..end]);
+            start = end;
+            if start == width {
+                break;
+            }
+        }
+        assert_eq!(pieces, whole, "frame {frame}, row {row} in pieces");
+    }
+}
+
+/// An operator that masks alone do not make, for tests of what works with any: frame t is moved by t columns, around the edge, then
+/// masked and summed, `y[i, j] = Σ_t C_t[i, j] x_t[i, (j + t) mod W]`, as a disperser moves the bands of a spectral camera.
+#[derive(Debug, Clone)]
+pub struct Sheared(MaskOperator);
+
+impl Sheared {
+    /// The operator of these masks.
+    pub fn new(masks: MaskStack) -> Self {
+        Self(MaskOperator::new(masks))
+    }
+
+    /// Moves frame t of `x` by t columns to the left, or to the right.
+    fn shear(x: ArrayView3<'_, f32>, mut to: ArrayViewMut3<'_, f32>, to_the_right: bool) {
+        let width = x.dim().2;
+        for (t, (x, mut to)) in x.outer_iter().zip(to.outer_iter_mut()).enumerate() {
+            let first = if to_the_right { width - t % width } else { t % width };
+            let parts = ndarray::concatenate(Axis(1), &[x.slice(s![.., first..]), x.slice(s![.., ..first])]);
+            to.assign(&parts.expect("two parts of one frame"));
+        }
+    }
+}
+
+impl SensingOperator for Sheared {
+    fn shape(&self) -> VideoShape {
+        self.0.shape()
+    }
+
+    fn forward_into(&self, x: ArrayView3<'_, f32>, y: ArrayViewMut2<'_, f32>) {
+        let mut sheared = Array3::zeros(x.dim());
+        Self::shear(x, sheared.view_mut(), false);
+        self.0.forward_into(sheared.view(), y);
+    }
+
+    fn adjoint_into(&self, y: ArrayView2<'_, f32>, x: ArrayViewMut3<'_, f32>) {
+        Self::shear(self.0.adjoint(y).view(), x, true);
+    }
+
+    fn gram(&self) -> ArrayView2<'_, f32> {
+        self.0.gram()
+    }
 }
 
 fn norm<'a>(values: impl Iterator<Item = &'a f32>) -> f64 {

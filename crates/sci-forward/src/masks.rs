@@ -1,12 +1,12 @@
 //! Mask stacks: validated once, so that no operator or solver has to ask again.
 
-use crate::VideoShape;
 use crate::operator::CLOSED;
-use ndarray::{Array2, Array3, ArrayView3, s};
+use crate::{MaskSource, ShiftingMasks, VideoShape};
+use ndarray::{Array2, Array3, ArrayView3, Dimension, IntoDimension, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Why an array is not a stack of masks.
+/// Why something is not a set of masks.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum MaskError {
@@ -42,6 +42,34 @@ pub enum MaskError {
     /// A density outside `(0, 1]`.
     #[error("mask density {0} is outside (0, 1]")]
     Density(f64),
+    /// Masks that are to be packed have more than one open value.
+    #[error("a mask holds {value} beside {open}: binary masks hold 0 and one other value")]
+    NotBinary {
+        /// The value that does not belong.
+        value: f32,
+        /// The open value that came first.
+        open: f32,
+    },
+    /// A moving pattern goes farther than it reaches, or by what is not a number.
+    #[error("a pattern of {rows}×{columns} pixels cannot move by {offset:?} pixels (down, right)")]
+    Offset {
+        /// Its rows.
+        rows: usize,
+        /// Its columns.
+        columns: usize,
+        /// How far it is to move, down and to the right.
+        offset: [f64; 2],
+    },
+    /// Something that each frame has one of has another number.
+    #[error("{found} {what} for {expected} frames: each frame has one")]
+    Count {
+        /// What.
+        what: &'static str,
+        /// The frames.
+        expected: usize,
+        /// How many there are.
+        found: usize,
+    },
 }
 
 /// The largest transmittance, in whatever unit: squares of measurements stay in the range of `f32`.
@@ -50,6 +78,7 @@ const MAX_TRANSMITTANCE: f32 = 1e9;
 /// `T` masks `C_t` `[T, H, W]`: transmittances from 0 to 1e9, binary or calibrated in any unit, at least one of them open.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskStack {
+    /// In row-major order.
     masks: Array3<f32>,
 }
 
@@ -65,26 +94,38 @@ impl MaskStack {
     /// assert!(sci_forward::MaskStack::new(array![[[0.0, -1.0]]]).is_err());
     /// ```
     pub fn new(masks: Array3<f32>) -> Result<Self, MaskError> {
-        let (frames, height, width) = masks.dim();
-        if frames * height * width == 0 {
-            return Err(MaskError::Empty { frames, height, width });
-        }
-        if let Some(((frame, row, column), &value)) =
-            masks.indexed_iter().find(|(_, v)| !(0.0..=MAX_TRANSMITTANCE).contains(*v))
-        {
-            return Err(MaskError::Value { value, frame, row, column });
-        }
-        if masks.iter().all(|&v| v * v <= CLOSED) {
-            return Err(MaskError::AllClosed);
-        }
         let masks = if masks.is_standard_layout() { masks } else { masks.as_standard_layout().into_owned() };
-        Ok(Self { masks })
+        validated(Self { masks })
+    }
+
+    /// The masks of any source, stored.
+    ///
+    /// # Errors
+    /// [`MaskError`] as in [`MaskStack::new`].
+    ///
+    /// ```
+    /// use sci_forward::{MaskStack, ShiftingMasks, VideoShape};
+    /// let shape = VideoShape { frames: 4, height: 3, width: 5 };
+    /// let masks = MaskStack::from_source(&ShiftingMasks::random(shape, 0.5, 1, [0.0, 1.0])?)?;
+    /// assert_eq!(masks, MaskStack::shifting(shape, 0.5, 1)?);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
+    pub fn from_source(source: &dyn MaskSource) -> Result<Self, MaskError> {
+        Self::new(stored(source))
     }
 
     /// Independent binary masks, each pixel open with probability `density`.
     ///
     /// # Errors
     /// [`MaskError::Density`] outside `(0, 1]`; [`MaskError::Empty`] or, for tiny shapes and densities, [`MaskError::AllClosed`].
+    ///
+    /// ```
+    /// use sci_forward::{MaskStack, VideoShape};
+    /// let masks = MaskStack::random(VideoShape { frames: 8, height: 64, width: 64 }, 0.25, 0)?;
+    /// assert!(masks.is_binary());
+    /// assert!((masks.view().mean().unwrap() - 0.25).abs() < 0.01);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
     pub fn random(shape: VideoShape, density: f64, seed: u64) -> Result<Self, MaskError> {
         Self::new(bernoulli(shape.dim(), density, seed)?)
     }
@@ -92,19 +133,20 @@ impl MaskStack {
     /// One random binary pattern `[H, W + T − 1]` that moves by a pixel a frame: `C_t = a[:, t..t + W]`,
     /// as a translating physical mask does (the masks of the gray benchmark were made so).
     ///
+    /// Other steps, fractions of a pixel among them, are [`ShiftingMasks`].
+    ///
     /// # Errors
     /// As [`MaskStack::random`].
+    ///
+    /// ```
+    /// use ndarray::s;
+    /// use sci_forward::{MaskStack, VideoShape};
+    /// let masks = MaskStack::shifting(VideoShape { frames: 2, height: 4, width: 6 }, 0.5, 0)?;
+    /// assert_eq!(masks.view().slice(s![0, .., 1..]), masks.view().slice(s![1, .., ..5]));
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
     pub fn shifting(shape: VideoShape, density: f64, seed: u64) -> Result<Self, MaskError> {
-        let (frames, height, width) = shape.dim();
-        if frames * height * width == 0 {
-            return Err(MaskError::Empty { frames, height, width });
-        }
-        let pattern = bernoulli((1, height, width + frames - 1), density, seed)?;
-        let mut masks = Array3::zeros(shape.dim());
-        for (t, mut mask) in masks.outer_iter_mut().enumerate() {
-            mask.assign(&pattern.slice(s![0, .., t..t + width]));
-        }
-        Self::new(masks)
+        Self::from_source(&ShiftingMasks::random(shape, density, seed, [0.0, 1.0])?)
     }
 
     /// The size of the video that these masks modulate.
@@ -127,48 +169,62 @@ impl MaskStack {
     pub fn sum(&self) -> Array2<f32> {
         self.masks.sum_axis(ndarray::Axis(0))
     }
+}
 
-    /// The masks with every transmittance of the pixels where `measured` `[H, W]` is false set to 0.
-    ///
-    /// To the operator such a pixel is one that no mask opens: it takes no part in the data step. Dead pixels
-    /// and pixels held out for validation are handled this way. What the measurement holds there counts as residual, so it is
-    /// best set to 0.
-    ///
-    /// # Errors
-    /// [`MaskError::AllClosed`] if nothing stays open.
-    ///
-    /// # Panics
-    /// If `measured` is not `[H, W]`.
-    pub fn restricted_to(mut self, measured: ndarray::ArrayView2<'_, bool>) -> Result<Self, MaskError> {
-        assert_eq!(measured.dim(), self.shape().image_dim(), "one flag per sensor pixel");
-        for mut mask in self.masks.outer_iter_mut() {
-            mask.zip_mut_with(&measured, |c, &keep| *c = if keep { *c } else { 0.0 });
+impl MaskSource for MaskStack {
+    fn shape(&self) -> VideoShape {
+        self.shape()
+    }
+
+    fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]) {
+        let row = self.masks.slice(s![frame, row, ..]).to_slice().expect("stored in row-major order");
+        out.copy_from_slice(&row[start..start + out.len()]);
+    }
+}
+
+fn stored(source: &dyn MaskSource) -> Array3<f32> {
+    let mut masks = Array3::zeros(source.shape().dim());
+    for (t, mut mask) in masks.outer_iter_mut().enumerate() {
+        for (row, mut values) in mask.outer_iter_mut().enumerate() {
+            source.fill(t, row, 0, values.as_slice_mut().expect("a row of a new array"));
         }
-        Self::new(self.masks)
     }
+    masks
 }
 
-/// Which pixels of a sensor `[H, W]` stay in use when one in each `spacing` × `spacing` block, drawn with `seed`, is held
-/// out for validation: true for those that stay. With a spacing of 1 none would stay: it must be at least 2.
-///
-/// # Panics
-/// If `spacing` is less than 2.
-pub fn held_in(image: (usize, usize), spacing: usize, seed: u64) -> Array2<bool> {
-    assert!(spacing >= 2, "a spacing of {spacing} leaves no pixel: it must be at least 2");
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut stays = Array2::from_elem(image, true);
-    for mut block in stays.exact_chunks_mut((spacing, spacing)) {
-        block[[rng.random_range(0..spacing), rng.random_range(0..spacing)]] = false;
+/// A source that has been checked: not empty, every transmittance in range, at least one open.
+pub(crate) fn validated<S: MaskSource>(source: S) -> Result<S, MaskError> {
+    let (frames, height, width) = source.shape().dim();
+    if frames * height * width == 0 {
+        return Err(MaskError::Empty { frames, height, width });
     }
-    stays
+    let mut values = vec![0.0; width];
+    let mut largest = 0f32;
+    for (frame, row) in (0..frames).flat_map(|t| (0..height).map(move |row| (t, row))) {
+        source.fill(frame, row, 0, &mut values);
+        if let Some(column) = values.iter().position(|v| !(0.0..=MAX_TRANSMITTANCE).contains(v)) {
+            return Err(MaskError::Value { value: values[column], frame, row, column });
+        }
+        largest = values.iter().fold(largest, |largest, &v| largest.max(v));
+    }
+    if largest * largest <= CLOSED { Err(MaskError::AllClosed) } else { Ok(source) }
 }
 
-fn bernoulli(dim: (usize, usize, usize), density: f64, seed: u64) -> Result<Array3<f32>, MaskError> {
+/// Independent values, 1 with probability `density`, else 0.
+pub(crate) fn bernoulli<I: IntoDimension>(
+    shape: I,
+    density: f64,
+    seed: u64,
+) -> Result<ndarray::Array<f32, I::Dim>, MaskError>
+where
+    I::Dim: Dimension,
+{
     if !(density > 0.0 && density <= 1.0) {
         return Err(MaskError::Density(density));
     }
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    Ok(Array3::from_shape_simple_fn(dim, || f32::from(u8::from(rng.random_bool(density)))))
+    let draw = || f32::from(u8::from(rng.random_bool(density)));
+    Ok(ndarray::Array::from_shape_simple_fn(shape.into_dimension(), draw))
 }
 
 #[cfg(test)]
@@ -206,22 +262,5 @@ mod tests {
         masks[[1, 2, 3]] = f32::NAN;
         check(masks, "NaN at frame 1, row 2, column 3");
         assert_eq!(MaskStack::random(SHAPE, 1.5, 0), Err(MaskError::Density(1.5)));
-    }
-
-    #[test]
-    fn one_pixel_of_each_block_is_held_out() {
-        let stays = held_in((31, 17), 5, 3);
-        assert_eq!(stays.iter().filter(|stays| !**stays).count(), 6 * 3);
-        assert!(stays.exact_chunks((5, 5)).into_iter().all(|block| block.iter().filter(|stays| !**stays).count() == 1));
-        assert_eq!(stays, held_in((31, 17), 5, 3));
-        assert_ne!(stays, held_in((31, 17), 5, 4));
-    }
-
-    #[test]
-    fn a_restricted_stack_closes_the_unmeasured_pixels() {
-        let mut measured = Array2::from_elem((31, 17), true);
-        measured[[3, 4]] = false;
-        let sum = MaskStack::new(Array3::ones(SHAPE.dim())).unwrap().restricted_to(measured.view()).unwrap().sum();
-        assert_eq!((sum[[3, 4]], sum[[3, 5]]), (0.0, 4.0));
     }
 }

@@ -1,0 +1,213 @@
+//! A measurement with what made it, checked once.
+
+use crate::bayer::{mosaic_adjoint_into, mosaic_into};
+use crate::operator::close;
+use crate::{CfaPattern, Restricted, SensingOperator, VideoShape};
+use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView4, Axis, Zip};
+use std::sync::Arc;
+
+/// Why an operator and an image are not a measurement, or a video does not belong to one.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MeasurementError {
+    /// An array has the wrong size.
+    #[error("the {what} is {found:?}, the masks ask for {expected:?}")]
+    Size {
+        /// Which array.
+        what: &'static str,
+        /// The size it must have.
+        expected: Vec<usize>,
+        /// The size it has.
+        found: Vec<usize>,
+    },
+    /// A pixel is NaN or infinite.
+    #[error("the measurement is {value} at index [{row}, {column}]: every value must be finite")]
+    NotFinite {
+        /// Its row.
+        row: usize,
+        /// Its column.
+        column: usize,
+        /// Its value.
+        value: f32,
+    },
+    /// No pixel is open.
+    #[error("no pixel that is measured is opened by a mask: there is nothing to reconstruct from")]
+    AllClosed,
+}
+
+/// A measurement and what made it: `y = H T v + noise`, `T` the mosaic of a color sensor, or the identity of a gray one.
+///
+/// Sizes and finiteness are checked here, once.
+///
+/// ```
+/// use ndarray::Array3;
+/// use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+/// use std::sync::Arc;
+///
+/// let shape = VideoShape { frames: 8, height: 6, width: 4 };
+/// let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 0)?));
+/// let y = h.forward(Array3::from_elem(shape.dim(), 0.5).view());
+/// let measurement = Measurement::new(h, y)?.with_cfa(Some(CfaPattern::Rggb));
+/// assert_eq!(measurement.channels(), 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone)]
+pub struct Measurement {
+    operator: Arc<dyn SensingOperator>,
+    /// In row-major order.
+    y: Array2<f32>,
+    cfa: Option<CfaPattern>,
+    scale: f64,
+}
+
+impl Measurement {
+    /// Takes `y` `[H, W]`, on the scale of `Σ_t C_t`, of a gray sensor.
+    ///
+    /// # Errors
+    /// [`MeasurementError::Size`] if `y` has not the size of the operator's frames, [`MeasurementError::NotFinite`] if a pixel is
+    /// NaN or infinite, [`MeasurementError::AllClosed`] if no pixel has `gram > 0`.
+    pub fn new(operator: Arc<dyn SensingOperator>, y: Array2<f32>) -> Result<Self, MeasurementError> {
+        check("measurement", y.shape(), operator.shape().image_dim().into())?;
+        if let Some(((row, column), &value)) = y.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            return Err(MeasurementError::NotFinite { row, column, value });
+        }
+        let y = if y.is_standard_layout() { y } else { y.as_standard_layout().into_owned() };
+        let (mut squares, mut open) = (0.0, 0usize);
+        Zip::from(&y).and(operator.gram()).for_each(|&y, &gram| {
+            if gram > 0.0 {
+                squares += f64::from(y).powi(2);
+                open += 1;
+            }
+        });
+        if open == 0 {
+            return Err(MeasurementError::AllClosed);
+        }
+        let scale = if squares > 0.0 { squares.sqrt() } else { (open as f64).sqrt() };
+        Ok(Self { operator, y, cfa: None, scale })
+    }
+
+    /// The same measurement by a sensor with this color filter array; `None` for a gray sensor.
+    pub fn with_cfa(self, cfa: Option<CfaPattern>) -> Self {
+        Self { cfa, ..self }
+    }
+
+    /// `H`.
+    pub fn operator(&self) -> &dyn SensingOperator {
+        &*self.operator
+    }
+
+    /// `H`, to be kept.
+    pub fn shared_operator(&self) -> &Arc<dyn SensingOperator> {
+        &self.operator
+    }
+
+    /// The measured image `[H, W]`, in row-major order.
+    pub fn y(&self) -> ArrayView2<'_, f32> {
+        self.y.view()
+    }
+
+    /// The color filter array of a color sensor.
+    pub fn cfa(&self) -> Option<CfaPattern> {
+        self.cfa
+    }
+
+    /// The size of the video where the sensor sees it.
+    pub fn shape(&self) -> VideoShape {
+        self.operator.shape()
+    }
+
+    /// Channels of the video: 3 of a color sensor's RGB, else 1.
+    pub fn channels(&self) -> usize {
+        if self.cfa.is_some() { 3 } else { 1 }
+    }
+
+    /// What a residual `‖y − H x‖` is divided by: `‖y‖` over the open pixels. A black measurement has no scale of its own: the square
+    /// root of their number, a residual in units of the full scale.
+    pub fn scale(&self) -> f64 {
+        self.scale
+    }
+
+    /// The measurement without the pixels where `measured` `[H, W]` is false: the operator is [`Restricted`], and `y` is 0 there.
+    ///
+    /// # Errors
+    /// [`MeasurementError::Size`] if `measured` has not the size of the measurement, [`MeasurementError::AllClosed`] if no open
+    /// pixel is left.
+    ///
+    /// ```
+    /// use ndarray::{Array3, array};
+    /// use sci_forward::{MaskOperator, MaskStack, Measurement};
+    /// use std::sync::Arc;
+    ///
+    /// let h = Arc::new(MaskOperator::new(MaskStack::new(Array3::ones((2, 1, 2)))?));
+    /// let whole = Measurement::new(h, array![[3.0, 4.0]])?;
+    /// let part = whole.restricted(array![[true, false]].view())?;
+    /// assert_eq!((whole.scale(), part.scale()), (5.0, 3.0));
+    /// assert_eq!(part.y(), array![[3.0, 0.0]]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn restricted(&self, measured: ArrayView2<'_, bool>) -> Result<Self, MeasurementError> {
+        check("map of measured pixels", measured.shape(), self.shape().image_dim().into())?;
+        let y = Zip::from(&self.y).and(measured).map_collect(|&y, &keep| if keep { y } else { 0.0 });
+        let operator = Arc::new(Restricted::new(self.operator.clone(), measured));
+        Ok(Self::new(operator, y)?.with_cfa(self.cfa))
+    }
+
+    /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`, 0 at the pixels that are not open.
+    ///
+    /// # Errors
+    /// [`MeasurementError::Size`] if `video` is not `[T, C, H, W]` with [`channels`](Self::channels) for C.
+    pub fn residual(&self, video: ArrayView4<'_, f32>) -> Result<Array2<f32>, MeasurementError> {
+        let (t, h, w) = self.shape().dim();
+        check("video", video.shape(), [t, self.channels(), h, w])?;
+        let mut residual = match self.cfa {
+            None => self.operator.forward(video.index_axis_move(Axis(1), 0)),
+            Some(cfa) => {
+                let mut mosaic = Array3::zeros((t, h, w));
+                mosaic_into(cfa, video, mosaic.view_mut());
+                self.operator.forward(mosaic.view())
+            }
+        };
+        residual -= &self.y;
+        close(residual.view_mut(), self.operator.gram());
+        Ok(residual)
+    }
+
+    /// `Tᵀ Hᵀ g` `[T, C, H, W]` of an image `g` `[H, W]`: in frame t `C_t ⊙ g`, in the channel that the pixel sees.
+    ///
+    /// # Panics
+    /// If `g` has not the size of the measurement.
+    ///
+    /// ```
+    /// use ndarray::{Array3, array};
+    /// use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement};
+    /// use std::sync::Arc;
+    ///
+    /// let h = Arc::new(MaskOperator::new(MaskStack::new(Array3::ones((1, 1, 2)))?));
+    /// let gray = Measurement::new(h, array![[1.0, 1.0]])?;
+    /// assert_eq!(gray.pull_back(array![[3.0, 4.0]].view()), array![[[[3.0, 4.0]]]]);
+    /// let color = gray.with_cfa(Some(CfaPattern::Rggb));
+    /// assert_eq!(color.pull_back(array![[3.0, 4.0]].view()), array![[[[3.0, 0.0]], [[0.0, 4.0]], [[0.0, 0.0]]]]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn pull_back(&self, g: ArrayView2<'_, f32>) -> Array4<f32> {
+        let mosaic = self.operator.adjoint(g);
+        let Some(cfa) = self.cfa else { return mosaic.insert_axis(Axis(1)) };
+        let (t, h, w) = mosaic.dim();
+        let mut rgb = Array4::zeros((t, 3, h, w));
+        mosaic_adjoint_into(cfa, mosaic.view(), rgb.view_mut());
+        rgb
+    }
+}
+
+impl std::fmt::Debug for Measurement {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Measurement").field("shape", &self.shape()).field("cfa", &self.cfa).finish_non_exhaustive()
+    }
+}
+
+fn check<const N: usize>(what: &'static str, found: &[usize], expected: [usize; N]) -> Result<(), MeasurementError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(MeasurementError::Size { what, expected: expected.to_vec(), found: found.to_vec() })
+}
