@@ -3,8 +3,9 @@
 use crate::*;
 use ndarray::{Array2, Array3, Axis, Zip};
 use sci_forward::testing::moving_square;
-use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+use sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
 use std::ops::ControlFlow;
+use std::sync::Arc;
 
 /// scikit-image's loop, in `f64`, by the definition.
 pub(crate) fn tv(image: &Array2<f64>, weight: f64, inner: usize) -> Array2<f64> {
@@ -64,7 +65,7 @@ struct Estimates(Vec<Array3<f32>>);
 
 impl Observer for Estimates {
     fn iteration(&mut self, it: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
-        self.0.push(it.estimate.to_owned());
+        self.0.push(it.estimate.sensor.clone());
         Ok(ControlFlow::Continue(()))
     }
 }
@@ -75,17 +76,17 @@ impl Observer for Estimates {
 fn the_drift_of_500_iterations_does_not_grow() {
     const ITERATIONS: usize = 500;
     let shape = VideoShape { frames: 8, height: 48, width: 40 };
-    let h = MaskOperator::new(MaskStack::random(shape, 0.5, 3).unwrap());
+    let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 3).unwrap()));
     let y = h.forward(moving_square(shape).view());
     let mut fast = Estimates(Vec::new());
-    let plan = Plan::new([Stage { sigma: 0.0, iterations: ITERATIONS }]);
-    let problem = Problem::new(&h, y.view()).unwrap();
+    let plan = Plan::new([Stage { sigma: None, iterations: ITERATIONS }]);
+    let problem = Measurement::new(h.clone(), y.clone()).unwrap();
     run(&mut Gap::accelerated(Tv::new(0.1)), &problem, Start::Mean, &plan, &mut fast).unwrap();
 
     let mut fast = fast.0.iter();
     let mut worst = 0.0;
     let mut k = 0;
-    gap_tv(&h.masks().view().mapv(f64::from), &y.mapv(f64::from), f64::from(0.1f32), ITERATIONS, |exact| {
+    gap_tv(&h.source().view().mapv(f64::from), &y.mapv(f64::from), f64::from(0.1f32), ITERATIONS, |exact| {
         let ours = fast.next().unwrap();
         let rms = (exact - &ours.mapv(f64::from)).mapv(|d| d * d).mean().unwrap().sqrt();
         k += 1;

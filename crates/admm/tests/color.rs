@@ -1,10 +1,11 @@
 //! Color solvers: exact fixed points, gray scenes through the color path, and the symmetry of the patterns.
 
 use admm::*;
-use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, s};
-use sci_forward::bayer::{Bilinear, CfaPattern, Demosaicer, Malvar, mosaic_into};
+use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Axis, s};
+use sci_forward::bayer::{Bilinear, CfaPattern, Demosaicer, Malvar, Menon, mosaic_into};
 use sci_forward::testing::{moving_square, uniform};
-use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+use sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+use std::sync::Arc;
 
 /// `D(x) = a x`.
 struct Scale(f32);
@@ -15,7 +16,7 @@ impl Denoiser for Scale {
     }
     fn denoise(
         &mut self,
-        _: &DenoiseCx,
+        _: &Call<'_>,
         x: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
@@ -24,8 +25,8 @@ impl Denoiser for Scale {
     }
 }
 
-fn problem_data(shape: VideoShape) -> (MaskOperator, Array2<f32>) {
-    let h = MaskOperator::new(MaskStack::random(shape, 0.6, 4).unwrap());
+fn problem_data(shape: VideoShape) -> (Arc<MaskOperator>, Array2<f32>) {
+    let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.6, 4).unwrap()));
     let y = h.forward(uniform(shape.dim(), 5).view());
     (h, y)
 }
@@ -95,13 +96,14 @@ fn solve(
     params: TwoStageParams,
     a: f32,
     iterations: usize,
-) -> (MaskOperator, Array2<f32>, Array3<f32>, Array4<f32>) {
+) -> (Arc<MaskOperator>, Array2<f32>, Array3<f32>, Array4<f32>) {
     let (h, y) = problem_data(TINY);
     let mut solver = TwoStage::new(Scale(a), Bilinear, x_step, CFA, params);
-    let plan = Plan::new([Stage { sigma: 0.1, iterations }]);
-    let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
+    let plan = Plan::new([Stage { sigma: Some(0.1), iterations }]);
+    let outcome =
+        run(&mut solver, &Measurement::new(h.clone(), y.clone()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
     assert_ne!(outcome.stop, StopReason::Diverged);
-    (h, y, outcome.estimate, outcome.rgb.unwrap())
+    (h, y, outcome.estimate.sensor, outcome.estimate.rgb.unwrap())
 }
 
 fn assert_close(a: impl IntoIterator<Item = f32>, b: impl IntoIterator<Item = f64>, tolerance: f64) {
@@ -113,7 +115,7 @@ fn assert_close(a: impl IntoIterator<Item = f32>, b: impl IntoIterator<Item = f6
 #[test]
 fn scaled_closed_form_reaches_the_exact_minimiser() {
     let (a, tau) = (0.8f32, 0.5f32);
-    let params = TwoStageParams { rho: 0.7, tau, alpha: 1.0, convention: Convention::Scaled };
+    let params = TwoStageParams { rho: 0.7, tau, convention: Convention::Scaled };
     let (h, y, _, rgb) = solve(XStep::ClosedForm { clip: false }, params, a, 3000);
     let ht = h_matrix(&h).dot(&t_matrix());
     let mu = f64::from(tau) * (1.0 / f64::from(a) - 1.0);
@@ -126,7 +128,7 @@ fn scaled_closed_form_reaches_the_exact_minimiser() {
 #[test]
 fn scaled_demosaicing_reaches_its_exact_fixed_point() {
     let (a, rho) = (0.8f64, 0.7f64);
-    let params = TwoStageParams { rho: rho as f32, tau: 1.0, alpha: 1.0, convention: Convention::Scaled };
+    let params = TwoStageParams { rho: rho as f32, tau: 1.0, convention: Convention::Scaled };
     let (h, y, theta, _) = solve(XStep::Demosaic, params, a as f32, 3000);
     let (hm, y) = (h_matrix(&h), y.mapv(f64::from).flatten().to_owned());
     // T M = 1, so q = a (q + b), b = (1/a − 1) q, and (HᵀH + ρ (1/a − 1)) q = Hᵀ y.
@@ -139,23 +141,24 @@ fn scaled_demosaicing_reaches_its_exact_fixed_point() {
 /// (With a denoiser that shrinks there is no other fixed point than 0: see the rustdoc of the convention.)
 #[test]
 fn the_papers_convention_reaches_its_exact_fixed_point() {
-    let params = TwoStageParams { rho: 1.0, tau: 2.0, alpha: 1.0, convention: Convention::PaperCode };
-    let h = MaskOperator::new(MaskStack::random(TINY, 0.6, 4).unwrap());
+    let params = TwoStageParams { rho: 1.0, tau: 2.0, convention: Convention::PaperCode };
+    let h = Arc::new(MaskOperator::new(MaskStack::random(TINY, 0.6, 4).unwrap()));
     let y = h.forward(uniform(TINY.dim(), 5).mapv(|v| 0.3 + 0.2 * v).view());
     let mut solver = TwoStage::new(Scale(1.0), Bilinear, XStep::Demosaic, CFA, params);
-    let plan = Plan::new([Stage { sigma: 0.1, iterations: 400 }]);
-    let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
-    let theta = &outcome.estimate;
+    let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 400 }]);
+    let outcome =
+        run(&mut solver, &Measurement::new(h.clone(), y.clone()).unwrap(), Start::Mean, &plan, &mut ()).unwrap();
+    let theta = &outcome.estimate.sensor;
     assert!(theta.iter().all(|&v| v > 0.0 && v < 1.0), "{theta}");
     assert!(outcome.relative_residual < 1e-6, "{}", outcome.relative_residual);
     let q = theta.mapv(f64::from).flatten().to_owned();
-    assert_close(outcome.rgb.unwrap(), demosaic_matrix(&mut Bilinear).dot(&q), 1e-5);
+    assert_close(outcome.estimate.rgb.unwrap(), demosaic_matrix(&mut Bilinear).dot(&q), 1e-5);
 }
 
 /// One step of the paper's closed form against a dense solve of `(ρ TᵀT + τ) x = ρ Tᵀ q + Tᵀ b + τ v + w`.
 #[test]
 fn the_papers_closed_form_is_the_dense_solution() {
-    let params = TwoStageParams { rho: 0.55, tau: 10.0, alpha: 1.0, convention: Convention::PaperCode };
+    let params = TwoStageParams { rho: 0.55, tau: 10.0, convention: Convention::PaperCode };
     let (rho, tau) = (0.55f64, 10.0f64);
     let (h, y) = problem_data(TINY);
     let (hm, tm, mm) = (h_matrix(&h), t_matrix(), demosaic_matrix(&mut Bilinear));
@@ -186,11 +189,12 @@ fn the_papers_closed_form_is_the_dense_solution() {
         w = w + &x - &v;
     }
     let mut solver = TwoStage::new(Scale(a as f32), Bilinear, XStep::ClosedForm { clip: false }, CFA, params);
-    let plan = Plan::new([Stage { sigma: 0.1, iterations: 3 }]);
+    let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 3 }]);
     let outcome =
-        run(&mut solver, &Problem::new(&h, y.view()).unwrap(), Start::From(start.view()), &plan, &mut ()).unwrap();
-    assert_close(outcome.estimate, theta, 1e-5);
-    assert_close(outcome.rgb.unwrap(), v, 1e-5);
+        run(&mut solver, &Measurement::new(h.clone(), y.clone()).unwrap(), Start::From(start.view()), &plan, &mut ())
+            .unwrap();
+    assert_close(outcome.estimate.sensor, theta, 1e-5);
+    assert_close(outcome.estimate.rgb.unwrap(), v, 1e-5);
 }
 
 /// A mosaic of a gray scene whose demosaicing is exact (a plane) goes through the color path as through the gray one.
@@ -200,8 +204,8 @@ fn a_gray_scene_through_the_color_path_equals_the_gray_path() {
     let (h, _) = problem_data(shape);
     let flat = Array3::from_shape_fn(shape.dim(), |(t, _, _)| 0.2 + 0.1 * t as f32);
     let y = h.forward(flat.view());
-    let problem = Problem::new(&h, y.view()).unwrap();
-    let plan = Plan::new([Stage { sigma: 0.0, iterations: 30 }]);
+    let problem = Measurement::new(h.clone(), y.clone()).unwrap();
+    let plan = Plan::new([Stage { sigma: None, iterations: 30 }]);
     // Frame by frame the mean, the same for every color.
     struct FrameMean;
     impl Denoiser for FrameMean {
@@ -210,7 +214,7 @@ fn a_gray_scene_through_the_color_path_equals_the_gray_path() {
         }
         fn denoise(
             &mut self,
-            _: &DenoiseCx,
+            _: &Call<'_>,
             x: ArrayView4<'_, f32>,
             mut out: ArrayViewMut4<'_, f32>,
         ) -> Result<(), BoxError> {
@@ -223,10 +227,10 @@ fn a_gray_scene_through_the_color_path_equals_the_gray_path() {
     let gray = run(&mut Gap::plain(FrameMean), &problem, Start::Mean, &plan, &mut ()).unwrap();
     let color = Demosaicked::new(FrameMean, Malvar, CfaPattern::Rggb);
     let color = run(&mut Gap::plain(color), &problem, Start::Mean, &plan, &mut ()).unwrap();
-    let worst = (&gray.estimate - &color.estimate).fold(0f32, |m, d| m.max(d.abs()));
+    let worst = (&gray.estimate.sensor - &color.estimate.sensor).fold(0f32, |m, d| m.max(d.abs()));
     // Malvar's green and red means of a noisy mosaic differ a little from the mosaic's own; the limit is the same.
     assert!(worst < 5e-3, "{worst}");
-    let rgb = color.rgb.unwrap();
+    let rgb = color.estimate.rgb.unwrap();
     assert_eq!(rgb.slice(s![.., 0, .., ..]), rgb.slice(s![.., 2, .., ..]));
 }
 
@@ -238,16 +242,18 @@ fn the_four_patterns_give_the_same_result_up_to_the_shift() {
     let scene = moving_square(big);
     let psnr = |cfa: CfaPattern, top: usize, left: usize| {
         let crop = |v: ArrayView3<'_, f32>| v.slice(s![.., top..top + 96, left..left + 96]).to_owned();
-        let h = MaskOperator::new(MaskStack::new(crop(masks.view())).unwrap());
+        let h = Arc::new(MaskOperator::new(MaskStack::new(crop(masks.view())).unwrap()));
         let truth = crop(scene.view());
         let y = h.forward(truth.view());
-        let params = TwoStageParams { rho: 1.0, tau: 100.0, alpha: 1.0, convention: Convention::PaperCode };
+        let params = TwoStageParams { rho: 1.0, tau: 100.0, convention: Convention::PaperCode };
         let mut solver = TwoStage::new(Tv::new(0.1), Malvar, XStep::Demosaic, cfa, params);
-        let plan = Plan::new([Stage { sigma: 0.0, iterations: 20 }]);
-        let start = Start::Tv { iterations: 20, weight: 0.1, bayer: true };
-        let outcome = run(&mut solver, &Problem::new(&h, y.view()).unwrap(), start, &plan, &mut ()).unwrap();
+        let plan = Plan::new([Stage { sigma: None, iterations: 20 }]);
+        let mut tv = PerLattice::new(Tv::new(0.1));
+        let start = Start::Warm { prior: &mut tv, stage: Stage { sigma: None, iterations: 20 } };
+        let outcome =
+            run(&mut solver, &Measurement::new(h.clone(), y.clone()).unwrap(), start, &plan, &mut ()).unwrap();
         let inner = s![.., 16..80, 16..80];
-        let (shifted, truth) = (outcome.estimate, truth);
+        let (shifted, truth) = (outcome.estimate.sensor, truth);
         let mse = (&shifted.slice(inner) - &truth.slice(inner)).mapv(|d| d * d).mean().unwrap();
         -10.0 * mse.log10()
     };
@@ -261,15 +267,160 @@ fn the_four_patterns_give_the_same_result_up_to_the_shift() {
 
 #[test]
 fn sub_lattices_are_denoised_apart() {
-    let noisy = uniform((2, 1, 20, 24), 3);
-    let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
-    let cx = DenoiseCx::new(0.0);
-    PerLattice::new(Tv::new(0.1)).denoise(&cx, noisy.view(), out.view_mut()).unwrap();
+    let noisy = uniform((2, 20, 24), 3);
+    let mut out =
+        Estimate { sensor: Array3::from_elem(noisy.dim(), f32::NAN), rgb: Some(Array4::zeros((2, 3, 20, 24))) };
+    PerLattice::new(Tv::new(0.1)).apply(&Call::default(), noisy.view(), &mut out).unwrap();
     for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-        let lattice = noisy.slice(s![.., .., row..;2, column..;2]).to_owned();
+        let lattice = noisy.slice(s![.., row..;2, column..;2]).to_owned().insert_axis(Axis(1));
         let mut alone = Array4::zeros(lattice.dim());
-        Tv::new(0.1).denoise(&cx, lattice.view(), alone.view_mut()).unwrap();
-        assert_eq!(out.slice(s![.., .., row..;2, column..;2]), alone);
+        Tv::new(0.1).denoise(&Call::default(), lattice.view(), alone.view_mut()).unwrap();
+        assert_eq!(out.sensor.slice(s![.., row..;2, column..;2]), alone.remove_axis(Axis(1)));
     }
-    assert!(out.iter().all(|v| v.is_finite()));
+    assert!(out.is_finite() && out.rgb.is_none(), "an RGB video of before is not of this estimate");
+}
+
+const SMALL: VideoShape = VideoShape { frames: 2, height: 24, width: 26 };
+
+fn small_problem() -> Measurement {
+    let h = Arc::new(MaskOperator::new(MaskStack::random(SMALL, 0.6, 4).unwrap()));
+    Measurement::new(h.clone(), h.forward(moving_square(SMALL).view())).unwrap().with_cfa(Some(CFA))
+}
+
+/// The RGB video, sampled, is the estimate at the sensor.
+fn assert_together(outcome: &Outcome) {
+    let mut mosaic = Array3::zeros(outcome.estimate.sensor.dim());
+    mosaic_into(CFA, outcome.estimate.rgb.as_ref().unwrap().view(), mosaic.view_mut());
+    assert_eq!(mosaic, outcome.estimate.sensor);
+}
+
+/// With held-out pixels, when the best iterate comes first without and then with an RGB video, and the other way round.
+#[test]
+fn the_best_iterate_has_its_own_rgb_video() {
+    let lattice = || Box::new(PerLattice::new(Tv::new(0.1))) as Box<dyn Prior>;
+    let demosaicked = || Box::new(Demosaicked::new(Tv::new(0.1), Malvar, CFA)) as Box<dyn Prior>;
+    let mut plan = Plan::new([Stage { sigma: None, iterations: 3 }, Stage { sigma: Some(0.01), iterations: 9 }]);
+    plan.hold_out = Some(HoldOut { spacing: 6, overshoot: 1e3, ..HoldOut::default() });
+    let solve = |priors: Vec<Box<dyn Prior>>| {
+        let mut gap = Gap::plain(PerStage::new(priors, vec![0, 1]));
+        run(&mut gap, &small_problem(), Start::Mean, &plan, &mut ()).unwrap()
+    };
+    assert_together(&solve(vec![lattice(), demosaicked()]));
+    let outcome = solve(vec![demosaicked(), lattice()]);
+    if outcome.estimate.rgb.is_some() {
+        assert_together(&outcome);
+    }
+}
+
+/// A prior that breaks in its fourth call, after which accelerated GAP goes on from the best iterate: that and its RGB video are the result,
+/// also when no iteration is left.
+#[test]
+fn after_a_divergence_sensor_and_rgb_are_of_the_same_iterate() {
+    struct Breaks;
+    impl Denoiser for Breaks {
+        fn name(&self) -> &str {
+            "breaks"
+        }
+        fn denoise(
+            &mut self,
+            call: &Call<'_>,
+            x: ArrayView4<'_, f32>,
+            mut out: ArrayViewMut4<'_, f32>,
+        ) -> Result<(), BoxError> {
+            // Only the colors that no pixel sees are broken: the sensor does not notice.
+            let broken = |c: usize, i: usize, j: usize| call.iteration == 3 && c != CFA.color_at(i, j) as usize;
+            for (((_, c, i, j), out), &x) in out.indexed_iter_mut().zip(&x) {
+                *out = if broken(c, i, j) { f32::NAN } else { x };
+            }
+            Ok(())
+        }
+    }
+    for iterations in [4, 5, 6] {
+        let plan = Plan::new([Stage { sigma: Some(0.1), iterations }]);
+        let mut gap = Gap::accelerated(Demosaicked::new(Breaks, Malvar, CFA));
+        let outcome = run(&mut gap, &small_problem(), Start::Mean, &plan, &mut ()).unwrap();
+        assert_eq!((outcome.stop, outcome.backed_off.unwrap().iteration), (StopReason::ScheduleDone, 3));
+        assert!(outcome.estimate.is_finite());
+        assert_together(&outcome);
+    }
+    let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 5 }]);
+    let mut gap = Gap::plain(Demosaicked::new(Breaks, Malvar, CFA));
+    let outcome = run(&mut gap, &small_problem(), Start::Mean, &plan, &mut ()).unwrap();
+    assert_eq!((outcome.stop, outcome.iterations), (StopReason::Diverged, 4));
+    assert_together(&outcome);
+}
+
+#[test]
+fn no_iteration_makes_no_rgb_video() {
+    let params = TwoStageParams { rho: 1.0, tau: 100.0, convention: Convention::PaperCode };
+    let solvers: [Box<dyn Solver>; 2] = [
+        Box::new(Gap::accelerated(Demosaicked::new(Scale(1.0), Malvar, CFA))),
+        Box::new(TwoStage::new(Scale(1.0), Malvar, XStep::Demosaic, CFA, params)),
+    ];
+    for mut solver in solvers {
+        let outcome = run(solver.as_mut(), &small_problem(), Start::Mean, &Plan::new([]), &mut ()).unwrap();
+        assert_eq!((outcome.iterations, outcome.estimate.rgb), (0, None));
+    }
+}
+
+#[test]
+fn a_demosaicer_that_fails_is_named() {
+    struct Fails;
+    impl Demosaicer for Fails {
+        fn name(&self) -> &str {
+            "blind"
+        }
+        fn demosaic(
+            &mut self,
+            _: CfaPattern,
+            _: ArrayView3<'_, f32>,
+            _: ArrayViewMut4<'_, f32>,
+        ) -> Result<(), BoxError> {
+            Err("no light".into())
+        }
+    }
+    let params = TwoStageParams { rho: 1.0, tau: 100.0, convention: Convention::Scaled };
+    let solvers: [Box<dyn Solver>; 2] = [
+        Box::new(Gap::accelerated(Demosaicked::new(Scale(1.0), Fails, CFA))),
+        Box::new(TwoStage::new(Scale(1.0), Fails, XStep::Demosaic, CFA, params)),
+    ];
+    let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 2 }]);
+    for mut solver in solvers {
+        let error = run(solver.as_mut(), &small_problem(), Start::Mean, &plan, &mut ()).unwrap_err();
+        assert_eq!(error.to_string(), "demosaicer blind failed in iteration 0");
+    }
+}
+
+/// Whoever drives the steps himself, with any count of iterations, begins anew with [`Solver::start`].
+#[test]
+fn the_first_step_is_the_one_after_start() {
+    let params = TwoStageParams { rho: 0.55, tau: 10.0, convention: Convention::PaperCode };
+    let problem = small_problem();
+    let mut solver = TwoStage::new(Scale(0.9), Bilinear, XStep::ClosedForm { clip: false }, CFA, params);
+    let start = Estimate::at_sensor(uniform(SMALL.dim(), 6));
+    let mut drive = |first: usize| {
+        let (mut current, mut next) = (start.clone(), Estimate::at_sensor(Array3::zeros(SMALL.dim())));
+        solver.start(&problem, &start);
+        for iteration in first..first + 3 {
+            let call = Call { iteration, ..Call::new(0.1) };
+            solver.step(&problem, &call, &current, &mut next).unwrap();
+            std::mem::swap(&mut current, &mut next);
+        }
+        current
+    };
+    assert_eq!(drive(0), drive(7));
+}
+
+#[test]
+fn two_stages_give_the_same_bits_for_any_number_of_threads() {
+    let solve = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let params = TwoStageParams { rho: 0.55, tau: 10.0, convention: Convention::Scaled };
+            let mut solver = TwoStage::new(Scale(0.9), Menon, XStep::ClosedForm { clip: true }, CFA, params);
+            let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 6 }]);
+            run(&mut solver, &small_problem(), Start::Mean, &plan, &mut ()).unwrap().estimate
+        })
+    };
+    assert_eq!(solve(1), solve(3));
 }

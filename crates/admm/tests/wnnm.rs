@@ -1,13 +1,13 @@
 //! [`Wnnm`] as a denoiser: sizes at the edge of what there is, and the same bits whoever counts.
 
-use admm::{DenoiseCx, Denoiser, Wnnm};
+use admm::{Call, Denoiser, Wnnm};
 use ndarray::Array4;
 use sci_forward::VideoShape;
 use sci_forward::testing::{gaussian, moving_square};
 
 fn denoised(wnnm: Wnnm, sigma: f32, noisy: &Array4<f32>) -> Array4<f32> {
     let (mut wnnm, mut out) = (wnnm, Array4::from_elem(noisy.dim(), f32::NAN));
-    wnnm.denoise(&DenoiseCx::new(sigma), noisy.view(), out.view_mut()).unwrap();
+    wnnm.denoise(&Call::new(sigma), noisy.view(), out.view_mut()).unwrap();
     out
 }
 

@@ -1,23 +1,22 @@
 //! Owns the step from a resolved experiment to objects that run: networks loaded once, solvers built for each measurement.
 
-use std::cell::{Cell, RefCell};
 use std::path::Path;
-use std::rc::Rc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use admm::{
-    Admm, BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, MomentumStart, Observer, Outcome, PerLattice,
-    PerStage, Plan, Problem, SolveError, Start, StopRule, TileConfig, TileCounts, Tiles, Tv, TwoStage, Wnnm,
+    Admm, BoxError, Demosaicked, Denoiser, Flips, Gap, MomentumStart, Observer, Outcome, PerLattice, PerStage, Plan,
+    Prior, SolveError, Solver, Start, StopRule, TileCounter, TileCounts, Tiles, Tv, TwoStage, Wnnm,
 };
 use anyhow::Context;
-use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4};
+use ndarray::{Array4, ArrayView3, ArrayViewMut4};
 use nets::kernels::Precision;
-use nets::{Frugal, HalfCounts, Network};
-use online::{AdaptiveDenoiser, Counts, Sequence, Snapshot, Task, Update};
+use nets::{MixedPrecision, Network, PrecisionCounter, PrecisionCounts};
+use online::{AdaptiveDenoiser, Sequence, Task, Update, UpdateCounts};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
-use sci_forward::{CfaPattern, Demosaicer};
+use sci_forward::{CfaPattern, Demosaicer, Measurement};
 
-use crate::config::check::{Momentum, Solver, Start as StartChoice};
+use crate::config::check::{Momentum, Solver as SolverChoice, Start as StartChoice};
 use crate::config::denoising::Inference;
 use crate::config::resolve::{Demosaicer as DemosaicerChoice, Denoiser as DenoiserChoice, Experiment, Online};
 use crate::io::scene::Scene;
@@ -59,6 +58,25 @@ impl Part {
         }
     }
 
+    /// On gray or RGB video as it is.
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Box<dyn Denoiser + 'p> {
+        match self {
+            Self::Tv { weight, inner } => Box::new(Tv::new(*weight).inner(*inner)),
+            Self::Wnnm(wnnm) => saving.tiles(*wnnm),
+            Self::Ffdnet(net, inference) => saving.network(net, *inference),
+            Self::Fastdvdnet(net, inference) => saving.network(net, *inference),
+        }
+    }
+
+    /// On what the sensor sees.
+    fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p> {
+        match (self, color) {
+            (Self::Tv { weight, inner }, Some(_)) => Box::new(PerLattice::new(Tv::new(*weight).inner(*inner))),
+            (part, Some(s)) => Box::new(Demosaicked::new(part.on_frames(saving), s.demosaicer.clone(), s.cfa)),
+            (part, None) => Box::new(part.on_frames(saving)),
+        }
+    }
+
     fn updates(&self) -> &[Update] {
         match self {
             Self::Tv { .. } | Self::Wnnm(_) => &[],
@@ -77,7 +95,7 @@ impl<'e> Factory<'e> {
     pub fn new(experiment: &'e Experiment, cfa: Option<CfaPattern>) -> anyhow::Result<Self> {
         if cfa.is_none() {
             let gray = "the scene is gray; name its Bayer pattern in data.cfa if it is a mosaic";
-            let two_stage = matches!(experiment.solver, Solver::TwoStage { .. });
+            let two_stage = matches!(experiment.solver, SolverChoice::TwoStage { .. });
             anyhow::ensure!(!two_stage, "solver.kind = \"two-stage\" is for color sensors: {gray}");
             anyhow::ensure!(experiment.demosaicer.is_none(), "solver.demosaicer has no effect: {gray}");
         }
@@ -114,17 +132,26 @@ impl<'e> Factory<'e> {
         previous: Option<ArrayView3<'_, f32>>,
         observer: &mut dyn Observer,
     ) -> anyhow::Result<Solved> {
-        let task = self.begin(scene, k)?;
+        let measurement = scene.measurement(k)?;
+        let task = self.begin(&measurement)?;
         let done: Vec<usize> = self.parts.iter().map(|part| part.updates().len()).collect();
-        let normal = start(self.experiment.start, self.color.is_some(), previous);
-        let (start, plan) = match &task {
-            Some(task) => (task.start(normal), task.plan(&self.plan)),
-            None => (normal, self.plan.clone()),
+        let plan = task.as_ref().map_or_else(|| self.plan.clone(), |task| task.plan(&self.plan));
+        let mut warm = self.warm_start_prior();
+        let normal = match (self.experiment.start, &mut warm, previous) {
+            (StartChoice::Adjoint, ..) => Start::Adjoint,
+            (StartChoice::Tv { iterations, .. }, Some(prior), _) => {
+                Start::Warm { prior: prior.as_mut(), stage: admm::Stage { sigma: None, iterations } }
+            }
+            (StartChoice::Previous, _, Some(video)) => Start::From(video),
+            _ => Start::Mean,
         };
-        let problem = Problem::new(scene.operator.as_ref(), scene.measurement(k))?;
-        let (outcome, work) = self.run(&problem, start, &plan, observer)?;
+        let start = match &task {
+            Some(task) => task.start(normal),
+            None => normal,
+        };
+        let (outcome, work) = self.run(&measurement, start, &plan, observer)?;
         if let Some(sequence) = &mut self.sequence {
-            sequence.finish(outcome.estimate.view());
+            sequence.finish(outcome.estimate.sensor.view());
         }
         let new = self.parts.iter().zip(done).flat_map(|(part, done)| &part.updates()[done..]);
         let updates: Vec<Update> = new.copied().collect();
@@ -132,60 +159,45 @@ impl<'e> Factory<'e> {
             relation: task.relation,
             warm_start: task.is_warm(),
             cut: task.cut,
-            counts: Counts::of(&updates),
+            counts: UpdateCounts::of(&updates),
             updates,
         });
         Ok(Solved { outcome, planned: plan.iterations(), work, adaptation })
     }
 
     /// What is known of a measurement from those before, where networks adapt; all of them turn to it.
-    fn begin(&mut self, scene: &Scene, k: usize) -> anyhow::Result<Option<Task>> {
+    fn begin(&mut self, measurement: &Measurement) -> anyhow::Result<Option<Task>> {
         let Some(sequence) = &mut self.sequence else { return Ok(None) };
-        let task = sequence.begin(Snapshot::new(scene.operator.clone(), scene.measurement(k), scene.cfa)?);
+        let task = sequence.begin(measurement.clone());
         self.parts.iter_mut().try_for_each(|part| part.prepare(&task))?;
         Ok(Some(task))
     }
 
+    /// The TV of a warm start, if the experiment begins with one.
+    fn warm_start_prior(&self) -> Option<Box<dyn Prior>> {
+        let StartChoice::Tv { weight, .. } = self.experiment.start else { return None };
+        let tv = Tv::new(weight);
+        Some(if self.color.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) })
+    }
+
     fn run(
         &mut self,
-        problem: &Problem<'_>,
+        measurement: &Measurement,
         start: Start<'_>,
         plan: &Plan,
         observer: &mut dyn Observer,
-    ) -> Result<(Outcome<()>, Work), SolveError> {
-        let calls = Rc::new(Cell::new(0));
-        let color = self.color.as_ref();
+    ) -> Result<(Outcome, Work), SolveError> {
         let begin = Instant::now();
-        let saving = Saving::of(self.experiment, problem);
+        let mut saving = Saving::of(self.experiment, measurement);
         let looked = begin.elapsed().as_secs_f64();
-        let inner = denoiser(self.experiment, &mut self.parts, color, &saving);
-        let denoiser = Counted { inner, calls: Rc::clone(&calls) };
-        let mut outcome = match (self.experiment.solver, color) {
-            (Solver::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) => {
-                let mut solver = TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params);
-                admm::run(&mut solver, problem, start, plan, observer)?.without_state()
-            }
-            (Solver::Gap { momentum }, _) => {
-                let gap = match momentum {
-                    None => Gap::plain(denoiser),
-                    Some(Momentum::Zero) => Gap::with_momentum(denoiser, MomentumStart::Zero),
-                    Some(Momentum::Measurement) => Gap::with_momentum(denoiser, MomentumStart::Measurement),
-                };
-                let mut gap = if self.experiment.skip.is_some() { gap.restarting() } else { gap };
-                admm::run(&mut gap, problem, start, plan, observer)?.without_state()
-            }
-            (Solver::Admm { gamma }, _) => {
-                let mut solver = Admm::new(denoiser, gamma);
-                admm::run(&mut solver, problem, start, plan, observer)?.without_state()
-            }
-            (Solver::TwoStage { .. }, None) => unreachable!("Factory::new refuses two-stage solvers for gray scenes"),
-        };
-        if let Some(sensor) = color {
+        let mut solver = solver(self.experiment, &mut self.parts, self.color.as_ref(), &mut saving);
+        let mut outcome = admm::run(solver.as_mut(), measurement, start, plan, observer)?;
+        drop(solver);
+        if let Some(sensor) = &self.color {
             sensor.complete(&mut outcome)?;
         }
         outcome.seconds += looked;
-        let (skipped_tiles, halved) = (saving.tiles.get().skipped(), saving.halves.get().share());
-        Ok((outcome, Work { calls: calls.get(), skipped_tiles, halved }))
+        Ok((outcome, saving.work()))
     }
 
     /// Writes the weights as they are now, of each network one file `adapted-N-KIND.safetensors`, N its place among the
@@ -207,126 +219,132 @@ impl<'e> Factory<'e> {
 }
 
 impl Sensor {
-    /// Sees to the RGB video where the solver has none of its own: after a prior on the mosaic, a divergence, or no
-    /// iteration at all.
-    fn complete(&self, outcome: &mut Outcome<()>) -> Result<(), SolveError> {
-        if outcome.rgb.is_some() && outcome.iterations > 0 {
-            return Ok(());
-        }
+    /// Sees to the RGB video where the estimate has none of its own: after a prior on the mosaic, or no iteration at all.
+    fn complete(&self, outcome: &mut Outcome) -> Result<(), SolveError> {
+        let (sensor, None) = (&outcome.estimate.sensor, &outcome.estimate.rgb) else { return Ok(()) };
         let begin = Instant::now();
-        let (frames, height, width) = outcome.estimate.dim();
+        let (frames, height, width) = sensor.dim();
         let mut rgb = Array4::zeros((frames, 3, height, width));
-        self.demosaicer.clone().demosaic(self.cfa, outcome.estimate.view(), rgb.view_mut()).map_err(|source| {
-            SolveError::Denoiser { name: "demosaicer".into(), iteration: outcome.iterations, source }
+        self.demosaicer.clone().demosaic(self.cfa, sensor.view(), rgb.view_mut()).map_err(|source| {
+            SolveError::Prior {
+                part: "demosaicer",
+                name: self.demosaicer.name.clone(),
+                iteration: outcome.iterations,
+                source,
+            }
         })?;
-        outcome.rgb = Some(rgb);
+        outcome.estimate.rgb = Some(rgb);
         outcome.seconds += begin.elapsed().as_secs_f64();
         Ok(())
     }
 }
 
-/// The prior of a solve: on gray or, for the two-stage solver, RGB video as it is; else on the mosaic.
-fn denoiser<'p>(
+/// The solver of a measurement with its priors: on gray or, for the two-stage solver, RGB video as it is; else on the mosaic.
+fn solver<'p>(
     experiment: &Experiment,
     parts: &'p mut [Part],
     color: Option<&Sensor>,
-    saving: &Saving,
-) -> PerStage<'p> {
-    let on_mosaic = color.filter(|_| !matches!(experiment.solver, Solver::TwoStage { .. }));
-    let denoisers = parts.iter_mut().map(|part| {
-        let on_frames = match part {
-            Part::Tv { weight, inner } => {
-                let tv = Tv::new(*weight).inner(*inner);
-                return if on_mosaic.is_some() { boxed(PerLattice::new(tv)) } else { boxed(tv) };
-            }
-            Part::Wnnm(wnnm) => saving.spare_tiles(*wnnm),
-            Part::Ffdnet(net, inference) => saving.spare(net, *inference),
-            Part::Fastdvdnet(net, inference) => saving.spare(net, *inference),
-        };
-        match on_mosaic {
-            None => on_frames,
-            Some(s) => boxed(Demosaicked::new(on_frames, s.demosaicer.clone(), s.cfa)),
+    saving: &mut Saving,
+) -> Box<dyn Solver + 'p> {
+    let of_stage = experiment.stages.iter().map(|s| s.denoiser).collect();
+    if let (SolverChoice::TwoStage { params, x_step }, Some(Sensor { cfa, demosaicer })) = (experiment.solver, color) {
+        let on_frames = parts.iter_mut().map(|part| part.on_frames(saving)).collect();
+        let denoiser = PerStage::<dyn Denoiser + 'p>::new(on_frames, of_stage);
+        return Box::new(TwoStage::new(denoiser, demosaicer.clone(), x_step, *cfa, params));
+    }
+    let priors = parts.iter_mut().map(|part| part.on_sensor(color, saving)).collect();
+    let prior = PerStage::<dyn Prior + 'p>::new(priors, of_stage);
+    match experiment.solver {
+        SolverChoice::Gap { momentum } => {
+            let gap = match momentum {
+                None => Gap::plain(prior),
+                Some(Momentum::Zero) => Gap::with_momentum(prior, MomentumStart::Zero),
+                Some(Momentum::Measurement) => Gap::with_momentum(prior, MomentumStart::Measurement),
+            };
+            Box::new(if experiment.skip.is_some() { gap.restarting() } else { gap })
         }
-    });
-    PerStage::new(denoisers.collect(), experiment.stages.iter().map(|s| s.denoiser).collect())
+        SolverChoice::Admm { gamma } => Box::new(Admm::new(prior, gamma)),
+        SolverChoice::TwoStage { .. } => unreachable!("Factory::new refuses two-stage solvers for gray scenes"),
+    }
 }
 
-fn boxed<'a>(denoiser: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
-    Box::new(denoiser)
-}
-
-/// What the denoiser of a solve did.
+/// What networks were spared in a solve.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Work {
-    /// Its calls.
-    pub calls: usize,
-    /// The share of the pixels of these calls that was left out.
+    /// The share of the pixels of all calls that was left out.
     pub skipped_tiles: f64,
     /// The share of what networks did that was in bf16 because the solve would not notice.
     pub halved: f64,
 }
 
-/// What networks may be spared of a measurement.
+/// What networks may be spared of a measurement, and what they were.
 struct Saving {
-    config: TileConfig,
     /// Which tiles stand still; nothing when all are wanted.
     still: Option<Vec<bool>>,
-    tiles: Rc<Cell<TileCounts>>,
     half_precision: bool,
-    halves: Rc<Cell<HalfCounts>>,
+    tiles: Vec<Arc<TileCounter>>,
+    halves: Vec<Arc<PrecisionCounter>>,
 }
 
 impl Saving {
     /// A network that adapts is given everything in full: its updates look at the whole measurement.
-    fn of(experiment: &Experiment, problem: &Problem<'_>) -> Self {
-        let config = TileConfig::default();
+    fn of(experiment: &Experiment, measurement: &Measurement) -> Self {
         let skip = experiment.skip.filter(|_| experiment.online.is_none());
-        let still = skip.is_some_and(|s| s.tiles).then(|| admm::still(problem, config.side));
-        let half_precision = skip.is_some_and(|s| s.half_precision);
-        Self { config, still, tiles: Rc::default(), half_precision, halves: Rc::default() }
+        Self {
+            still: skip.is_some_and(|s| s.tiles).then(|| admm::still(measurement)),
+            half_precision: skip.is_some_and(|s| s.half_precision),
+            tiles: Vec::new(),
+            halves: Vec::new(),
+        }
     }
 
-    fn spare<'a, N>(&self, net: &'a mut AdaptiveDenoiser<N>, inference: Inference) -> Box<dyn Denoiser + 'a>
+    fn network<'a, N>(&mut self, net: &'a mut AdaptiveDenoiser<N>, inference: Inference) -> Box<dyn Denoiser + 'a>
     where
         N: Network + Denoiser,
     {
-        let halves = self.half_precision && inference.precision == Precision::F32;
-        match (halves, inference.flips) {
-            (false, false) => self.spare_tiles(net),
-            (false, true) => self.spare_tiles(Flips::new(net)),
-            (true, false) => self.spare_tiles(Frugal::new(net, Rc::clone(&self.halves))),
-            (true, true) => self.spare_tiles(Flips::new(Frugal::new(net, Rc::clone(&self.halves)))),
+        let mut denoiser: Box<dyn Denoiser + 'a> = if self.half_precision && inference.precision == Precision::F32 {
+            let mixed = MixedPrecision::new(net);
+            self.halves.push(mixed.counter());
+            Box::new(mixed)
+        } else {
+            Box::new(net)
+        };
+        if inference.flips {
+            denoiser = Box::new(Flips::new(denoiser));
         }
+        self.tiles(denoiser)
     }
 
-    fn spare_tiles<'a>(&self, net: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
-        match &self.still {
-            Some(still) => Box::new(Tiles::new(net, self.config, still, Rc::clone(&self.tiles))),
-            None => Box::new(net),
+    fn tiles<'a>(&mut self, denoiser: impl Denoiser + 'a) -> Box<dyn Denoiser + 'a> {
+        let Some(still) = &self.still else { return Box::new(denoiser) };
+        let tiles = Tiles::new(denoiser, still);
+        self.tiles.push(tiles.counter());
+        Box::new(tiles)
+    }
+
+    fn work(&self) -> Work {
+        let (mut tiles, mut halves) = (TileCounts::default(), PrecisionCounts::default());
+        for TileCounts { asked, done } in self.tiles.iter().map(|counter| counter.counts()) {
+            (tiles.asked, tiles.done) = (tiles.asked + asked, tiles.done + done);
         }
+        for PrecisionCounts { asked, halved } in self.halves.iter().map(|counter| counter.counts()) {
+            (halves.asked, halves.halved) = (halves.asked + asked, halves.halved + halved);
+        }
+        Work { skipped_tiles: tiles.skipped(), halved: halves.share() }
     }
 }
 
 /// The outcome of one measurement, whatever the solver.
 #[derive(Debug)]
 pub struct Solved {
-    /// The result; its state is dropped.
-    pub outcome: Outcome<()>,
+    /// The result.
+    pub outcome: Outcome,
     /// The iterations that were to be run.
     pub planned: usize,
     /// What the denoiser did.
     pub work: Work,
     /// How the denoiser adapted, where it was to.
     pub adaptation: Option<Adaptation>,
-}
-
-fn start<'a>(choice: StartChoice, bayer: bool, previous: Option<ArrayView3<'a, f32>>) -> Start<'a> {
-    match (choice, previous) {
-        (StartChoice::Adjoint, _) => Start::Adjoint,
-        (StartChoice::Tv { iterations, weight }, _) => Start::Tv { iterations, weight, bayer },
-        (StartChoice::Previous, Some(x)) => Start::From(x),
-        (StartChoice::Mean | StartChoice::Previous, _) => Start::Mean,
-    }
 }
 
 fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>) -> anyhow::Result<Part> {
@@ -362,52 +380,35 @@ fn load(choice: &DenoiserChoice, cfa: Option<CfaPattern>, online: Option<Online>
 fn demosaicer(experiment: &Experiment) -> anyhow::Result<SharedDemosaicer> {
     let demosaicer: Box<dyn Demosaicer> = match (&experiment.demosaicer, experiment.solver) {
         (Some(DemosaicerChoice::Bilinear), _) => Box::new(Bilinear),
-        (Some(DemosaicerChoice::Malvar), _) | (None, Solver::TwoStage { .. }) => Box::new(Malvar),
+        (Some(DemosaicerChoice::Malvar), _) | (None, SolverChoice::TwoStage { .. }) => Box::new(Malvar),
         (Some(DemosaicerChoice::Menon), _) | (None, _) => Box::new(Menon),
         (Some(DemosaicerChoice::Ddnet { weights }), _) => {
             Box::new(nets::Ddnet::load(weights, nets::Ends::Circular).context("solver.weights")?)
         }
     };
-    Ok(SharedDemosaicer(Rc::new(RefCell::new(demosaicer))))
+    let name = demosaicer.name().to_owned();
+    Ok(SharedDemosaicer { name, shared: Arc::new(Mutex::new(demosaicer)) })
 }
 
-/// One demosaicer for all denoisers of a schedule, as a network is too large to have twice.
+/// One demosaicer for all priors of a schedule, as a network is too large to have twice.
 #[derive(Clone)]
-struct SharedDemosaicer(Rc<RefCell<Box<dyn Demosaicer>>>);
+struct SharedDemosaicer {
+    name: String,
+    shared: Arc<Mutex<Box<dyn Demosaicer>>>,
+}
 
 impl Demosaicer for SharedDemosaicer {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,
         mosaic: ArrayView3<'_, f32>,
         rgb: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        self.0.borrow_mut().demosaic(cfa, mosaic, rgb)
-    }
-}
-
-/// Counts calls for the run record.
-struct Counted<D> {
-    inner: D,
-    calls: Rc<Cell<usize>>,
-}
-
-impl<D: Denoiser> Denoiser for Counted<D> {
-    fn name(&self) -> &str {
-        self.inner.name()
-    }
-
-    fn denoise(
-        &mut self,
-        cx: &DenoiseCx,
-        noisy: ArrayView4<'_, f32>,
-        out: ArrayViewMut4<'_, f32>,
-    ) -> Result<(), BoxError> {
-        self.calls.set(self.calls.get() + 1);
-        self.inner.denoise(cx, noisy, out)
-    }
-
-    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
-        self.inner.rgb()
+        // A demosaicer keeps nothing that a panic could have left half done.
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner).demosaic(cfa, mosaic, rgb)
     }
 }

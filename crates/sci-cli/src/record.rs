@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use online::{Counts, Relation, Update};
+use online::{Relation, Update, UpdateCounts};
 use serde::{Deserialize, Serialize};
 
 use crate::io::{FileError, ReadError, read_file};
@@ -108,7 +108,7 @@ pub struct Adaptation {
     /// Whether the scene was cut before it.
     pub cut: bool,
     /// How many updates of which kind.
-    pub counts: Counts,
+    pub counts: UpdateCounts,
     /// Every update that was due, in order.
     pub updates: Vec<Update>,
 }

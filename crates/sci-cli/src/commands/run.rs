@@ -3,11 +3,11 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use admm::{BoxError, IterInfo, Observer, Plan, StopReason};
+use admm::{BoxError, Estimate, IterInfo, Observer, Plan, StopReason};
 use anyhow::Context;
-use ndarray::{Array3, Array4, ArrayView3, ArrayView4, Axis, CowArray};
+use ndarray::{ArrayView3, ArrayView4, Axis, CowArray};
 use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
-use sci_forward::{SensingOperator, VideoShape};
+use sci_forward::{Noise, VideoShape};
 
 use super::{Done, UsageError, catch_interrupts, interrupted};
 use crate::config::resolve::{Experiment, MaskSource, OutputFormat, Simulate};
@@ -18,7 +18,7 @@ use crate::io::scene::{self, Scene, Truth};
 use crate::progress::Progress;
 use crate::record::{MeanRecord, MeasurementRecord, Record, SCHEMA, Skipped, Trace, host};
 use crate::report::{self, MeasurementImages};
-use crate::simulate::{NoiseModel, simulate};
+use crate::simulate::{SeededNoise, simulate};
 
 /// Arguments of `sci run`.
 #[derive(Debug, clap::Args)]
@@ -69,8 +69,8 @@ fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
     // A single channel of a color sensor is its mosaic.
     let truth = if channels == 3 { Truth::Rgb(video) } else { Truth::Sensor(video.index_axis_move(Axis(1), 0)) };
     let masks = masks(s, &data.reading, height, width)?;
-    let noise = NoiseModel { sigma: s.sigma, photons: s.photons, seed: s.seed };
-    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, data.reading.cfa, &noise)?)
+    let noise = SeededNoise { noise: Noise::new(s.photons, f64::from(s.sigma))?, seed: s.seed };
+    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, data.reading.cfa, noise)?)
 }
 
 fn masks(
@@ -117,20 +117,7 @@ fn announce(experiment: &Experiment, scene: &Scene, count: usize) {
 /// One solved measurement.
 struct Solution {
     record: MeasurementRecord,
-    /// Gray or mosaic `[T, H, W]`.
-    estimate: Array3<f32>,
-    /// `[T, 3, H, W]`, for color.
-    rgb: Option<Array4<f32>>,
-}
-
-impl Solution {
-    /// What is shown and kept: `[T, C, H, W]`, RGB for color.
-    fn video(&self) -> ArrayView4<'_, f32> {
-        match &self.rgb {
-            Some(rgb) => rgb.view(),
-            None => self.estimate.view().insert_axis(Axis(1)),
-        }
-    }
+    estimate: Estimate,
 }
 
 fn solve_all(
@@ -147,11 +134,12 @@ fn solve_all(
         }
         let truth = scene.truth_of(k);
         let mut watch = Watch::new(truth, Progress::new(k, planned));
-        let previous = solutions.last().map(|s| s.estimate.view());
+        let previous = solutions.last().map(|s| s.estimate.sensor.view());
         let solved = factory.solve(scene, k, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
         let trace = watch.finish();
         let mut solution = solution(k, solved, truth, trace, planned);
-        solution.record.psnr_rgb_db = solution.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
+        solution.record.psnr_rgb_db =
+            solution.estimate.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
         outln!("{}", line(&solution.record));
         if solution.record.stop == crate::record::Stop::Diverged {
             eprintln!("{}", advice(&solution.record, experiment));
@@ -163,7 +151,7 @@ fn solve_all(
 
 fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, trace: Trace, whole: usize) -> Solution {
     let Solved { outcome, planned, work, adaptation } = solved;
-    let x = outcome.estimate.view();
+    let x = outcome.estimate.sensor.view();
     // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
     // does not.
     let left = match outcome.stop {
@@ -183,7 +171,7 @@ fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, tr
         backed_off: outcome.backed_off.map(Into::into),
         relative_residual: Some(outcome.relative_residual),
         updates: counts.kept,
-        denoiser_calls: work.calls,
+        denoiser_calls: outcome.iterations,
         skipped: Skipped {
             iterations: whole - planned + left,
             tiles: work.skipped_tiles,
@@ -193,7 +181,7 @@ fn solution(index: usize, solved: Solved, truth: Option<ArrayView3<'_, f32>>, tr
         online: adaptation,
         trace,
     };
-    Solution { record, estimate: outcome.estimate, rgb: outcome.rgb }
+    Solution { record, estimate: outcome.estimate }
 }
 
 /// Mean over the frames of the PSNR over all three colors, `[T, 3, H, W]`.
@@ -275,21 +263,30 @@ impl Observer for Watch<'_> {
         Ok(())
     }
 
+    fn warm_start(&mut self, _: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
+        Ok(go_on())
+    }
+
     fn iteration(&mut self, it: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
-        let psnr_db = self.truth.map(|truth| mean_over_frames(truth, it.estimate, psnr));
+        let psnr_db = self.truth.map(|truth| mean_over_frames(truth, it.estimate.sensor.view(), psnr));
         if psnr_db.is_some() {
             self.trace.psnr_db.push(psnr_db);
         }
         self.trace.relative_residual.push(Some(it.relative_residual));
         self.trace.relative_change.push(Some(it.relative_change));
         self.trace.seconds.push(it.seconds);
-        self.trace.sigma.push(it.sigma);
+        self.trace.sigma.push(it.sigma.unwrap_or(0.0));
         if it.predicted_error.is_some() {
             self.trace.predicted_error.push(it.predicted_error);
         }
         self.progress.step(it.iteration + 1, psnr_db);
-        Ok(if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+        Ok(go_on())
     }
+}
+
+/// Until Ctrl-C.
+fn go_on() -> ControlFlow<()> {
+    if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
 }
 
 /// Writes the run and says how it went.
@@ -347,7 +344,7 @@ fn write(
     let staging = Staging::new(out)?;
     let dir = staging.path();
     let output = &experiment.output;
-    let views: Vec<ArrayView4<'_, f32>> = solutions.iter().map(Solution::video).collect();
+    let views: Vec<ArrayView4<'_, f32>> = solutions.iter().map(|s| s.estimate.video()).collect();
     let video = ndarray::concatenate(Axis(0), &views).context("joining the measurements")?;
     // Pictures show white as white; the numbers are on the measurements' own scale.
     let scaled = if scene.unit == 1.0 { CowArray::from(video.view()) } else { CowArray::from(&video * scene.unit) };
@@ -372,10 +369,10 @@ fn write(
     let images: Vec<MeasurementImages<'_>> = solutions
         .iter()
         .map(|s| MeasurementImages {
-            measurement: scene.measurement(s.record.index),
-            recon: s.video(),
+            measurement: scene.y(s.record.index),
+            recon: s.estimate.video(),
             cfa: scene.cfa,
-            truth: match s.rgb {
+            truth: match s.estimate.rgb {
                 Some(_) => scene.rgb_of(s.record.index),
                 None => scene.truth_of(s.record.index).map(|t| t.insert_axis(Axis(1))),
             },

@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use ndarray::{Axis, s};
-use sci_forward::{CfaPattern, VideoShape};
+use ndarray::{Array2, Axis, s};
+use sci_forward::{CfaPattern, Noise, VideoShape};
 
 use super::mask::Kind;
 use super::{Done, UsageError, array_format, parse_density};
 use crate::io::output::{ArrayFormat, Part, write_arrays};
 use crate::io::scene::{self, Keys, Reading, Truth};
-use crate::simulate::{NoiseModel, simulate};
+use crate::simulate::{SeededNoise, simulate};
 
 /// Arguments of `sci simulate`.
 #[derive(Debug, clap::Args)]
@@ -109,18 +109,19 @@ impl Args {
             );
             truth = truth.slice_move(s![..wanted, .., .., ..]);
         }
-        let noise = NoiseModel { sigma: self.sigma / 255.0, photons: self.photons, seed: self.seed };
+        let noise = Noise::new(self.photons, f64::from(self.sigma / 255.0))?;
+        let noise = SeededNoise { noise, seed: self.seed };
         let truth = if cfa.is_some() { Truth::Rgb(truth) } else { Truth::Sensor(truth.index_axis_move(Axis(1), 0)) };
-        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, &noise)?;
+        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, noise)?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {w}"));
-        let mask = scene.operator.masks().view();
+        let mask = scene.operator.adjoint(Array2::ones((height, width)).view());
         let truth = match (&scene.rgb, &scene.truth) {
             (Some(rgb), _) => Part { name: "rgb", data: rgb.view(), is_light: true },
             (None, Some(x)) => Part { name: "orig", data: x.view().insert_axis(Axis(1)), is_light: true },
             (None, None) => unreachable!("a simulated scene keeps its truth"),
         };
         let parts = [
-            Part { name: "mask", data: mask.insert_axis(Axis(1)), is_light: false },
+            Part { name: "mask", data: mask.view().insert_axis(Axis(1)), is_light: false },
             Part { name: "meas", data: scene.measurements.view().insert_axis(Axis(1)), is_light: true },
             truth,
         ];

@@ -1,7 +1,7 @@
 //! Owns the rules of `[online]`.
 
 use nets::Parameters;
-use online::{AdaptConfig, Guard, Reuse, Schedule, SequenceConfig, Terms};
+use online::{AdaptConfig, Reuse, RollBackRule, SequenceConfig, UpdateSchedule};
 
 use super::check::{Checker, MAX_ITERATIONS};
 use super::denoising::Denoiser;
@@ -53,9 +53,7 @@ impl<'s> Checker<'s> {
         let adapt = AdaptConfig {
             schedule: self.updates(&k, preset.schedule)?,
             parameters: self.choice("online.parameters", &k.parameters, &PARAMETERS)?.unwrap_or(preset.parameters),
-            terms: self.terms(&k, preset.terms)?,
-            guard: self.guard(&k, preset.guard)?,
-            blind: self.number("online.blind", &k.blind, 0.01..=0.9)?.or(preset.blind),
+            roll_back: self.roll_back(&k, preset.roll_back)?,
             precision: self.precision("online.precision", &k.precision)?.unwrap_or(preset.precision),
             seed,
         };
@@ -70,18 +68,17 @@ impl<'s> Checker<'s> {
         if !enabled {
             return Ok(None);
         }
-        // What no single key can show, such as held_out and blind together.
         adapt.validate().map_err(|e| self.source.error(&table, format!("`online`: {e}")))?;
-        if denoisers.iter().all(|d| matches!(d, Denoiser::Tv { .. })) {
+        if denoisers.iter().all(|d| d.weights().is_none()) {
             return Err(self.source.error(&table, "[online] has no effect: no stage has a network to adapt"));
         }
         Ok(Some(Online { adapt, sequence, save }))
     }
 
-    fn updates(&self, k: &OnlineKeys, preset: Schedule) -> Result<Schedule, ConfigError> {
+    fn updates(&self, k: &OnlineKeys, preset: UpdateSchedule) -> Result<UpdateSchedule, ConfigError> {
         let whole = |key: &str, value: &Value, range| self.whole(&format!("online.{key}"), value, range);
         let max_updates = whole("max_updates", &k.max_updates, 0..=MAX_ITERATIONS)?;
-        Ok(Schedule {
+        Ok(UpdateSchedule {
             first: whole("first", &k.first, 0..=MAX_ITERATIONS)?.map_or(preset.first, |n| n as usize),
             interval: whole("interval", &k.interval, 1..=MAX_ITERATIONS)?.map_or(preset.interval, |n| n as usize),
             max_updates: max_updates.map_or(preset.max_updates, |n| Some(n as usize)),
@@ -94,23 +91,11 @@ impl<'s> Checker<'s> {
                 .number("online.input_noise", &k.input_noise, 0.0..=255.0)?
                 .map_or(preset.input_noise, |n| n as f32 / 255.0),
             growth: self.number("online.growth", &k.growth, 1.0..=1e6)?.unwrap_or(preset.growth),
-            keep_optimizer: self.flag("online.keep_optimizer", &k.keep_optimizer)?.unwrap_or(preset.keep_optimizer),
         })
     }
 
-    fn terms(&self, k: &OnlineKeys, preset: Terms) -> Result<Terms, ConfigError> {
-        let weight = |key: &str, value: &Value, preset: f64| {
-            Ok(self.number(&format!("online.{key}"), value, 0.0..=1e6)?.unwrap_or(preset))
-        };
-        Ok(Terms {
-            pseudo_clean: weight("pseudo_clean", &k.pseudo_clean, preset.pseudo_clean)?,
-            distance: weight("distance", &k.distance, preset.distance)?,
-            equivariance: weight("equivariance", &k.equivariance, preset.equivariance)?,
-        })
-    }
-
-    fn guard(&self, k: &OnlineKeys, preset: Guard) -> Result<Guard, ConfigError> {
-        Ok(Guard {
+    fn roll_back(&self, k: &OnlineKeys, preset: RollBackRule) -> Result<RollBackRule, ConfigError> {
+        Ok(RollBackRule {
             held_out: self.number("online.held_out", &k.held_out, 0.0..=0.9)?.unwrap_or(preset.held_out),
             back_off: self.number("online.back_off", &k.back_off, 1e-3..=1.0)?.unwrap_or(preset.back_off),
             patience: self

@@ -82,7 +82,7 @@ pub enum Start {
     Adjoint,
     /// The result of the measurement before; the first starts from the mean.
     Previous,
-    /// A few iterations of GAP-TV.
+    /// A few iterations of ADMM-TV.
     Tv {
         /// Iterations.
         iterations: usize,
@@ -106,7 +106,7 @@ pub enum Solver {
     },
     /// Two-stage ADMM, for color sensors.
     TwoStage {
-        /// ρ, τ, α and the convention.
+        /// ρ, τ and the convention.
         params: TwoStageParams,
         /// How the RGB video is made from the mosaic.
         x_step: XStep,
@@ -153,8 +153,8 @@ pub enum Momentum {
 /// One `[[stage]]`.
 #[derive(Clone, Debug)]
 pub struct Stage {
-    /// σ in 0..255 units, 0 for denoisers without one.
-    pub sigma: f32,
+    /// σ in 0..255 units, if the denoiser has one.
+    pub sigma: Option<f32>,
     /// Iterations.
     pub iterations: usize,
     /// Index into [`Checked::denoisers`].
@@ -434,7 +434,6 @@ impl<'s> Checker<'s> {
         let params = TwoStageParams {
             rho: positive("rho", &k.rho, 1.0)?,
             tau: positive("tau", &k.tau, 100.0)?,
-            alpha: positive("alpha", &k.alpha, 1.0)?,
             convention: self.choice("solver.convention", &k.convention, &legal)?.unwrap_or(Convention::PaperCode),
         };
         let clip = self.flag("solver.clip", &k.clip)?;
@@ -571,7 +570,7 @@ impl<'s> Checker<'s> {
         value: &Value,
         denoiser: &Denoiser,
         skips: bool,
-    ) -> Result<Vec<f32>, ConfigError> {
+    ) -> Result<Vec<Option<f32>>, ConfigError> {
         let key = format!("{stage}.sigma");
         let is_tv = matches!(denoiser, Denoiser::Tv { .. });
         let refuse = |problem: &str| {
@@ -580,7 +579,7 @@ impl<'s> Checker<'s> {
         };
         let Some(given) = value else {
             return if is_tv {
-                Ok(vec![0.0])
+                Ok(vec![None])
             } else {
                 refuse("is missing; legal: 0 to 255, in units of an 8-bit picture")
             };
@@ -593,16 +592,17 @@ impl<'s> Checker<'s> {
             Toml::String(auto) if auto == "auto" && denoiser.for_iterates() => {
                 refuse("= \"auto\" is for networks of any σ; this one was trained for the σ of its schedule")
             }
-            Toml::String(auto) if auto == "auto" => Ok(AUTO.map(|sigma| sigma as f32).to_vec()),
+            Toml::String(auto) if auto == "auto" => Ok(AUTO.map(|sigma| Some(sigma as f32)).to_vec()),
             Toml::Array(list) => {
                 let legal = "numbers from 0 to 255 in a list, in units of an 8-bit picture, one for each stage";
-                let each = |v: &Toml| as_number(v).filter(|sigma| SIGMAS.contains(sigma)).map(|sigma| sigma as f32);
+                let each =
+                    |v: &Toml| as_number(v).filter(|sigma| SIGMAS.contains(sigma)).map(|sigma| Some(sigma as f32));
                 let sigmas = self.legal(&key, value, legal, |_| {
                     list.iter().map(each).collect::<Option<Vec<_>>>().filter(|sigmas| !sigmas.is_empty())
                 })?;
                 Ok(sigmas.unwrap_or_default())
             }
-            _ => Ok(self.number(&key, value, SIGMAS)?.map(|sigma| sigma as f32).into_iter().collect()),
+            _ => Ok(self.number(&key, value, SIGMAS)?.map(|sigma| Some(sigma as f32)).into_iter().collect()),
         }
     }
 

@@ -110,7 +110,6 @@ pub struct AdmmKeys {
 pub struct TwoStageKeys {
     pub rho: Value,
     pub tau: Value,
-    pub alpha: Value,
     pub convention: Value,
     pub demosaicer: Value,
     pub weights: Value,
@@ -197,16 +196,11 @@ pub struct OnlineKeys {
     pub learning_rate: Value,
     pub input_noise: Value,
     pub growth: Value,
-    pub keep_optimizer: Value,
     pub parameters: Value,
     pub precision: Value,
-    pub pseudo_clean: Value,
-    pub distance: Value,
-    pub equivariance: Value,
     pub held_out: Value,
     pub back_off: Value,
     pub patience: Value,
-    pub blind: Value,
     pub save: Value,
 }
 

@@ -99,13 +99,18 @@ impl Denoiser {
             Self::Fastdvdnet { .. } => "fastdvdnet",
         }
     }
+
+    /// Whether it is a network.
+    pub fn is_network(&self) -> bool {
+        matches!(self, Self::Ffdnet { .. } | Self::Fastdvdnet { .. })
+    }
 }
 
 /// A stage to run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stage {
-    /// σ in `[0, 1]`.
-    pub sigma: f32,
+    /// σ in `[0, 1]`, if the denoiser has one.
+    pub sigma: Option<f32>,
     /// Iterations.
     pub iterations: usize,
     /// Index into [`Experiment::denoisers`].
@@ -205,7 +210,11 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
     let stages = checked
         .stages
         .iter()
-        .map(|s| Stage { sigma: s.sigma / SIGMA_UNIT, iterations: s.iterations, denoiser: s.denoiser })
+        .map(|s| Stage {
+            sigma: s.sigma.map(|sigma| sigma / SIGMA_UNIT),
+            iterations: s.iterations,
+            denoiser: s.denoiser,
+        })
         .collect();
     let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
     let mut experiment = Experiment {
@@ -389,7 +398,6 @@ impl Experiment {
                 "kind": "two-stage",
                 "rho": params.rho,
                 "tau": params.tau,
-                "alpha": params.alpha,
                 "convention": if params.convention == Convention::Scaled { "scaled" } else { "paper-code" },
             }),
         };
@@ -427,7 +435,7 @@ fn skip_json(s: &Skip) -> Value {
 }
 
 fn online_json(o: &Online) -> Value {
-    let (schedule, terms, guard) = (o.adapt.schedule, o.adapt.terms, o.adapt.guard);
+    let (schedule, guard) = (o.adapt.schedule, o.adapt.roll_back);
     json!({
         "enabled": true,
         "reuse": o.sequence.reuse,
@@ -440,16 +448,11 @@ fn online_json(o: &Online) -> Value {
         "learning_rate": schedule.learning_rate,
         "input_noise": schedule.input_noise,
         "growth": schedule.growth,
-        "keep_optimizer": schedule.keep_optimizer,
         "parameters": o.adapt.parameters,
         "precision": o.adapt.precision,
-        "pseudo_clean": terms.pseudo_clean,
-        "distance": terms.distance,
-        "equivariance": terms.equivariance,
         "held_out": guard.held_out,
         "back_off": guard.back_off,
         "patience": guard.patience,
-        "blind": o.adapt.blind,
         "save": o.save,
     })
 }
@@ -481,12 +484,16 @@ mod tests {
         let stages = |more: &str| {
             let path = format!("data.path={}", configs.join("demo/bunny").display());
             let experiment = load(&configs.join("gray/refined.toml"), &[path, more.into()]).unwrap();
-            experiment.stages.iter().map(|s| (s.sigma * SIGMA_UNIT, s.iterations, s.denoiser)).collect::<Vec<_>>()
+            experiment
+                .stages
+                .iter()
+                .map(|s| (s.sigma.map(|sigma| sigma * SIGMA_UNIT), s.iterations, s.denoiser))
+                .collect::<Vec<_>>()
         };
         let refined = stages("seed=0");
         assert_eq!(refined.len(), 14);
-        assert_eq!(refined[..2], [(20.0, 1, 0), (18.0, 1, 0)]);
-        assert_eq!(refined[12..], [(12.0, 6, 1), (8.0, 6, 1)]);
+        assert_eq!(refined[..2], [(Some(20.0), 1, 0), (Some(18.0), 1, 0)]);
+        assert_eq!(refined[12..], [(Some(12.0), 6, 1), (Some(8.0), 6, 1)]);
         let written_out = "stage=[{sigma=9.5,iterations=3},{sigma=4,iterations=3}]";
         assert_eq!(stages("stage=[{sigma=[9.5, 4],iterations=3}]"), stages(written_out));
     }

@@ -73,8 +73,7 @@ impl Skip {
 /// Lets TV go first where a network would: as a stage of its own from the mean, for as long as it pays, so that the network
 /// begins where TV ends. A start by TV does that already, and so does a two-stage solver.
 pub(super) fn cheap_first(e: &mut Experiment) {
-    let networks_first =
-        e.stages.first().is_some_and(|s| !matches!(e.denoisers[s.denoiser], resolve::Denoiser::Tv { .. }));
+    let networks_first = e.stages.first().is_some_and(|s| e.denoisers[s.denoiser].is_network());
     let starts_with_tv = matches!(e.start, Start::Tv { .. }) || matches!(e.solver, Solver::TwoStage { .. });
     if !e.skip.is_some_and(|s| s.cheap_first) || !networks_first || starts_with_tv {
         return;
@@ -85,6 +84,6 @@ pub(super) fn cheap_first(e: &mut Experiment) {
     if let Solver::Gap { momentum: Some(momentum) } = &mut e.solver {
         *momentum = Momentum::Measurement;
     }
-    e.stages.insert(0, Stage { sigma: 0.0, iterations: 16, denoiser: e.denoisers.len() });
+    e.stages.insert(0, Stage { sigma: None, iterations: 16, denoiser: e.denoisers.len() });
     e.denoisers.push(resolve::Denoiser::Tv { weight: 0.15, inner: 5 });
 }

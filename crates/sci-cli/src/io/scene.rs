@@ -9,7 +9,9 @@ use std::sync::Arc;
 
 use ndarray::{Array3, Array4, ArrayD, ArrayView2, ArrayView3, ArrayView4, Axis, Ix3, Ix4, IxDyn, s};
 use sci_forward::bayer::mosaic_into;
-use sci_forward::{CfaPattern, MaskError, MaskOperator, MaskStack, SensingOperator};
+use sci_forward::{
+    BinaryMasks, CfaPattern, MaskError, MaskOperator, MaskStack, Measurement, MeasurementError, SensingOperator,
+};
 
 use super::defects::{self, Defects};
 use super::samples::{Array, SampleType, Samples};
@@ -177,10 +179,10 @@ fn list(names: &[String]) -> String {
 }
 
 /// Masks, measurements and truth that fit together.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Scene {
-    /// C `[B, H, W]` as an operator.
-    pub operator: Arc<MaskOperator>,
+    /// H of the masks C `[B, H, W]`; binary ones take a bit a pixel.
+    pub operator: Arc<dyn SensingOperator>,
     /// y `[N, H, W]`, up to `Σ_t C_t`.
     pub measurements: Array3<f32>,
     /// x `[T, H, W]` in `[0, 1]`, the mosaic for color; frame `k·B + t` belongs to measurement k.
@@ -194,6 +196,12 @@ pub struct Scene {
     pub unit: f32,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
+}
+
+impl std::fmt::Debug for Scene {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Scene").field("shape", &self.operator.shape()).field("cfa", &self.cfa).finish_non_exhaustive()
+    }
 }
 
 /// What was in front of the camera.
@@ -250,11 +258,15 @@ impl Scene {
                 (Some(x), Some(rgb))
             }
         };
-        let operator = Arc::new(MaskOperator::new(masks));
+        let brightest = masks.sum().iter().copied().fold(0.0, f32::max);
+        let operator: Arc<dyn SensingOperator> = match BinaryMasks::new(&masks) {
+            Ok(binary) => Arc::new(MaskOperator::new(binary)),
+            Err(_) => Arc::new(MaskOperator::new(masks)),
+        };
         let mut warnings = Vec::new();
         let measurements = match (measurements, &truth) {
             (Some(m), _) => m,
-            (None, Some(x)) => simulate(file, &operator, x.view(), &mut warnings)?,
+            (None, Some(x)) => simulate(file, operator.as_ref(), x.view(), &mut warnings)?,
             (None, None) => {
                 return Err(SceneError::MissingKey {
                     file: file.into(),
@@ -265,7 +277,7 @@ impl Scene {
             }
         };
         let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, warnings };
-        scene.look_for_wrong_scales();
+        scene.look_for_wrong_scales(brightest);
         Ok(scene)
     }
 
@@ -284,11 +296,22 @@ impl Scene {
         self.len() == 0
     }
 
+    /// Measurement `k` with what made it.
+    ///
+    /// # Errors
+    /// None that is known: a scene's parts fit.
+    ///
+    /// # Panics
+    /// If `k` is not below [`Scene::len`].
+    pub fn measurement(&self, k: usize) -> Result<Measurement, MeasurementError> {
+        Ok(Measurement::new(Arc::clone(&self.operator), self.y(k).to_owned())?.with_cfa(self.cfa))
+    }
+
     /// y `[H, W]` of measurement `k`.
     ///
     /// # Panics
     /// If `k` is not below [`Scene::len`].
-    pub fn measurement(&self, k: usize) -> ArrayView2<'_, f32> {
+    pub fn y(&self, k: usize) -> ArrayView2<'_, f32> {
         self.measurements.index_axis(Axis(0), k)
     }
 
@@ -306,9 +329,9 @@ impl Scene {
         (rgb.len_of(Axis(0)) >= (k + 1) * b).then(|| rgb.slice(s![k * b..(k + 1) * b, .., .., ..]))
     }
 
-    /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers.
-    fn look_for_wrong_scales(&mut self) {
-        let brightest = self.operator.masks().sum().iter().copied().fold(0.0, f32::max);
+    /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers; `brightest` is what white measures at
+    /// most.
+    fn look_for_wrong_scales(&mut self, brightest: f32) {
         let peak = self.measurements.iter().copied().fold(0.0, f32::max);
         if peak > 2.0 * brightest {
             self.warnings.push(format!(
@@ -318,7 +341,7 @@ impl Scene {
         let mismatch = (!self.is_empty()).then(|| self.truth_of(0)).flatten().map(|x| {
             let expected = self.operator.forward(x);
             let (mut off, mut all) = (0.0f64, 0.0f64);
-            for (&a, &b) in expected.iter().zip(self.measurement(0)) {
+            for (&a, &b) in expected.iter().zip(self.y(0)) {
                 off += f64::from(a - b).powi(2);
                 all += f64::from(b).powi(2);
             }
@@ -359,7 +382,7 @@ fn check_finite(file: &str, key: &str, array: ArrayView3<'_, f32>) -> Result<(),
 /// y `[N, H, W]` of a video `[T, H, W]`, N = T / B rounded down.
 fn simulate(
     file: &str,
-    operator: &MaskOperator,
+    operator: &dyn SensingOperator,
     truth: ArrayView3<'_, f32>,
     warnings: &mut Vec<String>,
 ) -> Result<Array3<f32>, SceneError> {
@@ -736,7 +759,7 @@ mod tests {
         let truth = scene.truth_of(1).unwrap();
         assert_eq!(truth[[1, 2, 3]], (180.0 + 23.0) / 255.0);
         // Pixel (2, 3): mask 0 is open (0 + 2 + 3 odd), mask 1 closed.
-        assert_eq!(scene.measurement(0)[[2, 3]], 23.0 / 255.0);
+        assert_eq!(scene.y(0)[[2, 3]], 23.0 / 255.0);
         assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
     }
 
@@ -753,10 +776,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = write_scene(dir.path(), Some(column_major((2, 3, 4), |_, _, _| 1e8 * 255.0)));
         let scene = read(&path, &Reading::default()).unwrap();
-        assert_eq!((scene.unit, scene.measurement(1)[[1, 2]]), (1e8, 1.0));
+        assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1e8, 1.0));
         assert!(scene.warnings[0].contains("white is taken to be 1e8"), "{:?}", scene.warnings);
         let scene = read(&path, &Reading { scale: Some(255.0), ..Reading::default() }).unwrap();
-        assert_eq!((scene.unit, scene.measurement(1)[[1, 2]]), (1.0, 1e8));
+        assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1.0, 1e8));
     }
 
     #[test]
@@ -765,7 +788,7 @@ mod tests {
         let meas = column_major((2, 3, 4), |t, y, x| if (t, y, x) == (1, 2, 0) { f32::NAN } else { 200.0 });
         let reading = Reading { defects: Defects::Exclude, ..Reading::default() };
         let scene = read(&write_scene(dir.path(), Some(meas)), &reading).unwrap();
-        assert_eq!(scene.operator.masks().sum()[[2, 0]], 0.0);
+        assert_eq!(scene.operator.gram()[[2, 0]], 0.0);
         assert!(scene.measurements.iter().all(|v| v.is_finite()));
         assert!(scene.warnings[0].contains("1 not finite at (row, column) (2, 0)"), "{:?}", scene.warnings);
     }

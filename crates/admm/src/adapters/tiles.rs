@@ -1,46 +1,26 @@
-//! Owns the denoiser that leaves out what a scene does not need: tiles that stand still, and tiles that have settled.
+//! The decorator that leaves out what a scene does not need: static tiles, and tiles that have settled.
 
-use crate::{BoxError, DenoiseCx, Denoiser};
+use crate::{BoxError, Call, Denoiser};
 use ndarray::parallel::prelude::*;
 use ndarray::{Array3, Array4, ArrayView4, ArrayViewMut4, Axis, Zip, s};
-use std::cell::Cell;
 use std::ops::Range;
-use std::rc::Rc;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Smallest side of a tile.
-const BLOCK: usize = 16;
+/// Side of a tile in pixels, a multiple of every network's grid.
+pub(crate) const SIDE: usize = 32;
+/// Pixels around a region that a denoiser is given besides it: what the region sees of its surroundings.
+const HALO: usize = 16;
+/// A static tile whose frames come to differ by so many times the least that they differed moves after all.
+const WAKE: f64 = 3.0;
+/// A tile is settled while the root mean square change of its input is at most this, in units of σ.
+const SETTLED: f32 = 0.05;
 /// Mean square deviation of frames that never wakes a tile.
 const FLOOR: f64 = (2.0 / 255.0) * (2.0 / 255.0);
 /// Frames that differ by so many σ are alike but for what the denoiser takes for noise.
 const QUIET: f32 = 1.25;
 /// A call that would save less than this share of its pixels is made in one piece.
 const LEAST_SAVED: f64 = 0.1;
-
-/// What [`Tiles`] leaves out.
-///
-/// | Parameter | Default | Purpose | Range |
-/// |---|---|---|---|
-/// | `side` | 32 | side of a tile in pixels | even, ≥ 16 |
-/// | `halo` | 16 | pixels around a region that is denoised by itself | even |
-/// | `wake` | 3 | growth of the frames' deviations that wakes a still tile | > 1 |
-/// | `settled` | 0.05 | largest change of a settled tile's input, in units of σ | ≥ 0 |
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TileConfig {
-    /// Side of a tile in pixels, even.
-    pub side: usize,
-    /// Pixels around a region that the denoiser is given besides it, even: what the region sees of its surroundings.
-    pub halo: usize,
-    /// A still tile whose frames come to differ by so many times the least that they differed moves after all.
-    pub wake: f64,
-    /// A tile is settled while the root mean square change of its input is at most this, in units of σ.
-    pub settled: f32,
-}
-
-impl Default for TileConfig {
-    fn default() -> Self {
-        Self { side: 32, halo: 16, wake: 3.0, settled: 0.05 }
-    }
-}
 
 /// Pixels that a denoiser was asked for, and those that it was spared.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -58,24 +38,44 @@ impl TileCounts {
     }
 }
 
+/// [`TileCounts`] while they grow, to be read when the denoiser has been given away.
+#[derive(Debug, Default)]
+pub struct TileCounter {
+    asked: AtomicU64,
+    done: AtomicU64,
+}
+
+impl TileCounter {
+    /// The counts as they are now.
+    pub fn counts(&self) -> TileCounts {
+        TileCounts { asked: self.asked.load(Ordering::Relaxed), done: self.done.load(Ordering::Relaxed) }
+    }
+
+    fn add(&self, asked: usize, done: usize) {
+        self.asked.fetch_add(asked as u64, Ordering::Relaxed);
+        self.done.fetch_add(done as u64, Ordering::Relaxed);
+    }
+}
+
 /// Gives the inner denoiser only what is needed.
 ///
-/// * *Still tiles*, which the measurement tells ([`still`](crate::still)): the mean of their frames is denoised once, for all
+/// Tiles have 32 × 32 pixels.
+///
+/// * *Static tiles*, which the measurement tells ([`still`](crate::still)): the mean of their frames is denoised once, for all
 ///   of them. Their frames differ by what the data step adds, frame by frame, to explain the measurement; a tile whose
-///   frames come to differ by `wake` times the least of before, and by more than 1.25 σ, is woken for good, as
-///   no still picture explains it.
-/// * *Settled tiles.* A tile whose input has changed by less than `settled · σ` since it was last denoised, in the same
+///   frames come to differ by 3 times the least of before, and by more than 1.25 σ, is woken for good, as
+///   no static picture explains it.
+/// * *Settled tiles.* A tile whose input has changed by at most 0.05 σ (root mean square) since it was last denoised, in the same
 ///   stage, keeps its output. The solver goes on to push its input towards the measurement, so that a residual wakes it.
 ///
-/// What is left is denoised in rectangles with a halo, or as a whole where that saves nothing. The inner denoiser must not
+/// What is left is denoised in rectangles with a halo of 16 pixels, or as a whole where that saves nothing. The inner denoiser must not
 /// depend on where in the picture it is; it is called with as many frames as there are, or with one.
 pub struct Tiles<D> {
     inner: D,
-    config: TileConfig,
     memory: Option<Memory>,
     /// For each tile the least deviation of its frames so far, in mean squares; nothing where it moves.
     still: Vec<Option<f64>>,
-    counts: Rc<Cell<TileCounts>>,
+    counter: Arc<TileCounter>,
 }
 
 /// What was denoised last.
@@ -98,44 +98,45 @@ enum Need {
 }
 
 impl<D: Denoiser> Tiles<D> {
-    /// Around a denoiser; `still` says which tiles stand still, in rows, as [`still`](crate::still) finds them. What is
-    /// left out is added to `counts`.
-    ///
-    /// # Panics
-    /// If a setting is out of its range.
-    pub fn new(inner: D, config: TileConfig, still: &[bool], counts: Rc<Cell<TileCounts>>) -> Self {
-        let TileConfig { side, halo, wake, settled } = config;
-        let sizes = side >= BLOCK && side % 2 == 0 && halo % 2 == 0;
-        assert!(sizes, "tiles of {side} with a halo of {halo}: both must be even, a side at least {BLOCK}");
-        assert!(wake > 1.0 && settled >= 0.0, "wake = {wake} must be greater than 1, settled = {settled} at least 0");
+    /// Around a denoiser; `still` says which tiles stand still, in rows, as [`still`](crate::still) finds them; empty: none.
+    pub fn new(inner: D, still: &[bool]) -> Self {
         let still = still.iter().map(|&still| still.then_some(f64::INFINITY)).collect();
-        Self { inner, config, memory: None, still, counts }
+        Self { inner, memory: None, still, counter: Arc::default() }
     }
 
-    fn count(&self, asked: usize, done: usize) {
-        let TileCounts { asked: before, done: done_before } = self.counts.get();
-        self.counts.set(TileCounts { asked: before + asked as u64, done: done_before + done as u64 });
+    /// What was left out so far, also when the denoiser itself is out of reach.
+    pub fn counter(&self) -> Arc<TileCounter> {
+        Arc::clone(&self.counter)
+    }
+
+    /// Takes every tile for a moving one if nothing is known of them.
+    fn fit(&mut self, grid: Grid) -> Result<(), BoxError> {
+        if self.still.is_empty() {
+            self.still.resize(grid.len(), None);
+        }
+        let (known, tiles) = (self.still.len(), grid.len());
+        if known == tiles { Ok(()) } else { Err(format!("{known} tiles are known, the video has {tiles}").into()) }
     }
 
     /// What each tile of the grid needs.
-    fn needs(&mut self, cx: &DenoiseCx, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
-        self.still.resize(grid.len(), None);
-        let memory = self.memory.as_ref().filter(|m| m.stage == cx.stage && m.input.dim() == noisy.dim());
-        let (config, begun) = (self.config, self.memory.is_some());
-        let noise = FLOOR.max(f64::from(QUIET * cx.sigma).powi(2));
+    fn needs(&mut self, call: &Call<'_>, noisy: ArrayView4<'_, f32>, grid: Grid) -> Vec<Need> {
+        let memory = self.memory.as_ref().filter(|m| m.stage == call.stage && m.input.dim() == noisy.dim());
+        let sigma = call.sigma.unwrap_or(0.0);
+        let begun = self.memory.is_some();
+        let noise = FLOOR.max(f64::from(QUIET * sigma).powi(2));
         let need = |(tile, still): (usize, &mut Option<f64>)| {
             let (rows, columns) = grid.tile(tile);
             let now = noisy.slice(s![.., .., rows.clone(), columns.clone()]);
             // Before the first call nothing has made the frames alike, or unlike.
             if let (Some(least), true) = (&*still, begun) {
                 let deviation = deviation(now);
-                let awake = deviation > noise.max(*least * config.wake.powi(2));
+                let awake = deviation > noise.max(*least * WAKE.powi(2));
                 *still = if awake { None } else { Some(least.min(deviation)) };
             }
             let settled = memory.is_some_and(|memory| {
                 let then = memory.input.slice(s![.., .., rows, columns]);
                 let sum = Zip::from(&now).and(&then).fold(0.0, |sum, a, b| sum + f64::from(a - b).powi(2));
-                sum <= f64::from(config.settled * cx.sigma).powi(2) * now.len() as f64
+                sum <= f64::from(SETTLED * sigma).powi(2) * now.len() as f64
             });
             match still {
                 _ if settled => Need::Settled,
@@ -149,14 +150,14 @@ impl<D: Denoiser> Tiles<D> {
     /// Denoises the mean of all frames and puts it into the tiles that need no more.
     fn denoise_mean(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         out: &mut ArrayViewMut4<'_, f32>,
         tiles: &[(Range<usize>, Range<usize>)],
     ) -> Result<(), BoxError> {
         let mean = mean_frame(noisy).insert_axis(Axis(0));
         let mut denoised = Array4::zeros(mean.dim());
-        self.inner.denoise(cx, mean.view(), denoised.view_mut())?;
+        self.inner.denoise(call, mean.view(), denoised.view_mut())?;
         for (rows, columns) in tiles {
             let from = denoised.slice(s![0, .., rows.clone(), columns.clone()]);
             for mut frame in out.slice_mut(s![.., .., rows.clone(), columns.clone()]).outer_iter_mut() {
@@ -174,26 +175,27 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         let (frames, _, height, width) = noisy.dim();
-        let grid = Grid { height, width, side: self.config.side };
-        let needs = self.needs(cx, noisy, grid);
+        let grid = Grid { height, width, side: SIDE };
+        self.fit(grid)?;
+        let needs = self.needs(call, noisy, grid);
         let of = |need: Need| (0..needs.len()).filter(|&i| needs[i] == need).map(|i| grid.tile(i)).collect::<Vec<_>>();
         let still = of(Need::MeanFrame);
         let moving = rectangles(&needs, grid);
-        let with_halo: Vec<_> = moving.iter().map(|(r, c)| grid.grown(r, c, self.config.halo)).collect();
+        let with_halo: Vec<_> = moving.iter().map(|(r, c)| grid.grown(r, c, HALO)).collect();
         let area = |(rows, columns): &(Range<usize>, Range<usize>)| rows.len() * columns.len();
         let all = frames * height * width;
         let work =
             frames * with_halo.iter().map(area).sum::<usize>() + if still.is_empty() { 0 } else { height * width };
         let whole = work as f64 > (1.0 - LEAST_SAVED) * all as f64;
-        self.count(all, if whole { all } else { work });
+        self.counter.add(all, if whole { all } else { work });
         if whole {
-            self.inner.denoise(cx, noisy, out.view_mut())?;
-            self.memory = Some(Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
+            self.inner.denoise(call, noisy, out.view_mut())?;
+            self.memory = Some(Memory { stage: call.stage, input: noisy.to_owned(), output: out.to_owned() });
             return Ok(());
         }
         if let Some(memory) = &self.memory {
@@ -203,20 +205,20 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
             }
         }
         if !still.is_empty() {
-            self.denoise_mean(cx, noisy, &mut out, &still)?;
+            self.denoise_mean(call, noisy, &mut out, &still)?;
         }
         for ((rows, columns), (halo_rows, halo_columns)) in moving.iter().zip(&with_halo) {
             let input = noisy.slice(s![.., .., halo_rows.clone(), halo_columns.clone()]).to_owned();
             let mut denoised = Array4::zeros(input.dim());
-            self.inner.denoise(cx, input.view(), denoised.view_mut())?;
+            self.inner.denoise(call, input.view(), denoised.view_mut())?;
             let (top, left) = (rows.start - halo_rows.start, columns.start - halo_columns.start);
             let core = denoised.slice(s![.., .., top..top + rows.len(), left..left + columns.len()]);
             out.slice_mut(s![.., .., rows.clone(), columns.clone()]).assign(&core);
         }
         let memory = self.memory.take().filter(|m| m.input.dim() == noisy.dim());
         let mut memory =
-            memory.unwrap_or_else(|| Memory { stage: cx.stage, input: noisy.to_owned(), output: out.to_owned() });
-        memory.stage = cx.stage;
+            memory.unwrap_or_else(|| Memory { stage: call.stage, input: noisy.to_owned(), output: out.to_owned() });
+        memory.stage = call.stage;
         for (rows, columns) in of(Need::MeanFrame).into_iter().chain(of(Need::Frames)) {
             let tile = s![.., .., rows, columns];
             memory.input.slice_mut(tile).assign(&noisy.slice(tile));
@@ -224,10 +226,6 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
         }
         self.memory = Some(memory);
         Ok(())
-    }
-
-    fn rgb(&self) -> Option<ArrayView4<'_, f32>> {
-        self.inner.rgb()
     }
 }
 

@@ -1,8 +1,11 @@
-//! Owns what a run does not have to do: some measured pixels are held out, and say when a stage or the run has done its work.
+//! Validation pixels: some measured pixels are held out of a run, and say when a stage or the run has done its work.
 
-use crate::{Problem, SolveError};
-use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, Zip};
-use sci_forward::{SensingOperator, held_in};
+use crate::{Estimate, SolveError};
+use ndarray::parallel::prelude::*;
+use ndarray::{Array2, ArrayView3, Axis, Zip};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sci_forward::Measurement;
 
 /// A part of the measurement is held out of the data steps to judge the iterates by, and stages that do nothing for it
 /// are cut short. The result is the best iterate.
@@ -18,8 +21,8 @@ use sci_forward::{SensingOperator, held_in};
 /// independent. At the others it is the part of the error in the range of `Hᵀ`, 1/T of the dimensions, which a jump of σ
 /// makes large where the pixels held out see nothing.
 ///
-/// A stage ends when an iteration takes less than `gain` off E, or when after `patience` iterations it has not gone below
-/// the best E before it. The run ends when two stages in a row did not and the best E is `2 patience` iterations
+/// A stage ends when an iteration takes less than `gain` off E, once E has gone below the best of the stages before; a stage that has not
+/// is given `patience` iterations. The run ends when two stages in a row did not and the best E is `2 patience` iterations
 /// old, so that short stages have the patience of long ones, and when one did not while E rose in each of the last
 /// `patience` iterations: a smaller σ, which overshoots at first, would have made it fall again. A stage whose σ is more than `overshoot · √E`
 /// is not begun, unless it is the last: it would smooth more than there is to smooth.
@@ -57,13 +60,39 @@ impl Default for HoldOut {
     }
 }
 
+impl HoldOut {
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// [`SolveError::Setting`] for the first that is out of range.
+    pub fn validate(&self) -> Result<(), SolveError> {
+        let Self { spacing, gain, patience, overshoot, .. } = *self;
+        let check =
+            |key, value, legal, ok: bool| if ok { Ok(()) } else { Err(SolveError::Setting { key, value, legal }) };
+        check("hold_out.spacing", spacing as f64, "it must be at least 2", spacing >= 2)?;
+        check("hold_out.gain", gain, "it must be at least 0 and less than 1", (0.0..1.0).contains(&gain))?;
+        check("hold_out.patience", patience as f64, "it must be at least 2", patience >= 2)?;
+        check("hold_out.overshoot", overshoot, "it must be greater than 0", overshoot > 0.0)
+    }
+
+    /// Which pixels of a sensor `[H, W]` stay in use: all but one in each block.
+    fn draw(&self, image: (usize, usize)) -> Array2<bool> {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        let mut stays = Array2::from_elem(image, true);
+        for mut block in stays.exact_chunks_mut((self.spacing, self.spacing)) {
+            block[[rng.random_range(0..self.spacing), rng.random_range(0..self.spacing)]] = false;
+        }
+        stays
+    }
+}
+
 /// The share of `√E` that a denoiser may be off. Independent errors of a tenth add a hundredth to E, 0.04 dB; momentum adds them up:
 /// with 0.13 three clips lost 0.15 to 0.19 dB, and with 0.3 in all stages but the last the benchmark's runner lost 0.7.
 const TOLERANCE: f64 = 0.1;
 
 /// What the rule says after an iteration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(super) enum Verdict {
     GoOn,
     EndStage,
     Stop,
@@ -93,8 +122,8 @@ impl Rule {
         Self { config, best: start, best_before: start, last: start, in_stage: 0, failed: 0, idle: 0, rising: 0 }
     }
 
-    fn skips(&self, sigma: f32) -> bool {
-        f64::from(sigma) > self.config.overshoot * self.best.sqrt()
+    fn skips(&self, sigma: Option<f32>) -> bool {
+        sigma.is_some_and(|sigma| f64::from(sigma) > self.config.overshoot * self.best.sqrt())
     }
 
     /// Takes the error after an iteration; `last_of_stage` when the schedule ends the stage here.
@@ -118,21 +147,19 @@ impl Rule {
     }
 }
 
-/// The pixels held out of one problem.
-pub(crate) struct HeldOut<'a> {
-    full: Problem<'a>,
-    operator: Box<dyn SensingOperator>,
-    /// y, 0 at the pixels held out.
-    y: Array2<f32>,
+/// The pixels held out of one measurement.
+pub(super) struct HeldOut {
+    full: Measurement,
+    given: Measurement,
     /// The weight of r² in E.
     weight: Array2<f32>,
 }
 
-impl<'a> HeldOut<'a> {
+impl HeldOut {
     /// Nothing where there are too few pixels to hold any out.
-    pub(crate) fn new(full: Problem<'a>, config: &HoldOut) -> Option<Self> {
-        let stays = held_in(full.y().dim(), config.spacing.max(2), config.seed);
-        let gram = full.operator().gram_diag();
+    pub(super) fn new(full: &Measurement, config: &HoldOut) -> Option<Self> {
+        let stays = config.draw(full.y().dim());
+        let gram = full.operator().gram();
         let count = |kept: bool| {
             Zip::from(&stays).and(gram).fold(0u32, |n, &stays, &gram| n + u32::from(gram > 0.0 && stays == kept))
         };
@@ -140,86 +167,74 @@ impl<'a> HeldOut<'a> {
         if held == 0 || used == 0 {
             return None;
         }
-        let operator = full.operator().restricted_to(stays.view()).ok()?;
-        let frames = full.operator().shape().frames as f32;
+        let given = full.restricted(stays.view()).ok()?;
+        let frames = full.shape().frames as f32;
         let weight = Zip::from(&stays).and(gram).map_collect(|&stays, &gram| match stays {
             _ if gram <= 0.0 => 0.0,
             true => 1.0 / (gram * frames * used as f32),
             false => 1.0 / (gram * held as f32),
         });
-        let y = Zip::from(full.y()).and(&stays).map_collect(|&y, &stays| if stays { y } else { 0.0 });
-        Some(Self { full, operator, y, weight })
+        Some(Self { full: full.clone(), given, weight })
     }
 
     /// What the solver is given.
-    pub(crate) fn problem(&self) -> Result<Problem<'_>, SolveError> {
-        Problem::new(self.operator.as_ref(), self.y.view())
+    pub(super) fn given(&self) -> &Measurement {
+        &self.given
     }
 
-    /// E of an iterate.
-    pub(crate) fn error(&self, x: ArrayView3<'_, f32>) -> f64 {
+    /// E of an iterate: rows in parallel, their sums in order.
+    fn error(&self, x: ArrayView3<'_, f32>) -> f64 {
         let hx = self.full.operator().forward(x);
-        Zip::from(self.full.y())
-            .and(&hx)
-            .and(&self.weight)
-            .fold(0.0, |sum, &y, &hx, &weight| sum + f64::from(weight) * f64::from(y - hx).powi(2))
+        let y = self.full.y();
+        let of_row = |row: usize| {
+            let (y, hx, weight) = (y.row(row), hx.row(row), self.weight.row(row));
+            let square = |y: f32, hx: f32| f64::from(y - hx).powi(2);
+            Zip::from(y).and(hx).and(weight).fold(0.0, |sum, &y, &hx, &weight| sum + f64::from(weight) * square(y, hx))
+        };
+        let rows: Vec<f64> = (0..y.len_of(Axis(0))).into_par_iter().map(of_row).collect();
+        rows.into_iter().sum()
     }
 }
 
 /// The rule, and the best iterate so far.
-pub(crate) struct Judge<'a, 'p> {
-    held_out: &'a HeldOut<'p>,
+pub(super) struct Judge<'a> {
+    held_out: &'a HeldOut,
     rule: Rule,
-    best: Option<Best>,
+    best: Option<(f64, Estimate)>,
 }
 
-/// An iterate that is kept.
-pub(crate) struct Best {
-    error: f64,
-    pub(crate) estimate: Array3<f32>,
-    pub(crate) rgb: Option<Array4<f32>>,
-}
-
-impl<'a, 'p> Judge<'a, 'p> {
+impl<'a> Judge<'a> {
     /// `start` is what the run starts from.
-    pub(crate) fn new(held_out: &'a HeldOut<'p>, config: HoldOut, start: ArrayView3<'_, f32>) -> Self {
-        Self { held_out, rule: Rule::new(config, held_out.error(start)), best: None }
+    pub(super) fn new(held_out: &'a HeldOut, config: HoldOut, start: &Estimate) -> Self {
+        Self { held_out, rule: Rule::new(config, held_out.error(start.sensor.view())), best: None }
     }
 
     /// Judges an iterate and keeps it if it is the best; returns E and what to do.
-    pub(crate) fn judge(
-        &mut self,
-        estimate: ArrayView3<'_, f32>,
-        rgb: Option<ArrayView4<'_, f32>>,
-        last_of_stage: bool,
-    ) -> (f64, Verdict) {
-        let error = self.held_out.error(estimate);
+    pub(super) fn judge(&mut self, estimate: &Estimate, last_of_stage: bool) -> (f64, Verdict) {
+        let error = self.held_out.error(estimate.sensor.view());
         match &mut self.best {
-            Some(best) if error >= best.error => {}
-            Some(Best { error: best, estimate: x, rgb: x_rgb }) => {
+            Some((best, _)) if error >= *best => {}
+            Some((best, kept)) => {
                 *best = error;
-                x.assign(&estimate);
-                if let (Some(x_rgb), Some(rgb)) = (x_rgb, rgb) {
-                    x_rgb.assign(&rgb);
-                }
+                kept.assign(estimate);
             }
-            None => self.best = Some(Best { error, estimate: estimate.to_owned(), rgb: rgb.map(|rgb| rgb.to_owned()) }),
+            None => self.best = Some((error, estimate.clone())),
         }
         (error, self.rule.observe(error, last_of_stage))
     }
 
     /// Whether a stage with this σ has nothing to do.
-    pub(crate) fn skips(&self, sigma: f32) -> bool {
+    pub(super) fn skips(&self, sigma: Option<f32>) -> bool {
         self.rule.skips(sigma)
     }
 
-    /// For [`DenoiseCx::tolerance`](crate::DenoiseCx::tolerance).
-    pub(crate) fn tolerance(&self) -> f32 {
+    /// For [`Call::tolerance`](crate::Call::tolerance).
+    pub(super) fn tolerance(&self) -> f32 {
         (TOLERANCE * self.rule.best.sqrt()) as f32
     }
 
-    pub(crate) fn into_best(self) -> Option<Best> {
-        self.best
+    pub(super) fn into_best(self) -> Option<Estimate> {
+        self.best.map(|(_, estimate)| estimate)
     }
 }
 
@@ -227,7 +242,8 @@ impl<'a, 'p> Judge<'a, 'p> {
 mod tests {
     use super::*;
     use sci_forward::testing::moving_square;
-    use sci_forward::{MaskOperator, MaskStack, VideoShape};
+    use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+    use std::sync::Arc;
 
     /// How many of `errors` the rule looks at in stages of at most 6, where stages end, and whether it stops.
     fn follow(start: f64, errors: &[f64]) -> (Vec<usize>, bool) {
@@ -284,30 +300,73 @@ mod tests {
     #[test]
     fn a_stage_that_would_smooth_too_much_is_skipped() {
         let mut rule = Rule::new(HoldOut::default(), 1.0);
-        assert!(!rule.skips(0.5));
+        assert!(!rule.skips(Some(0.5)));
         rule.observe(0.01, false);
-        assert!(rule.skips(0.23) && !rule.skips(0.21));
+        assert!(rule.skips(Some(0.23)) && !rule.skips(Some(0.21)) && !rule.skips(None));
+    }
+
+    #[test]
+    fn one_pixel_of_each_block_is_held_out() {
+        let draw = |seed| HoldOut { spacing: 5, seed, ..HoldOut::default() }.draw((31, 17));
+        let stays = draw(3);
+        assert_eq!(stays.iter().filter(|stays| !**stays).count(), 6 * 3);
+        assert!(stays.exact_chunks((5, 5)).into_iter().all(|block| block.iter().filter(|stays| !**stays).count() == 1));
+        assert_eq!(stays, draw(3));
+        assert_ne!(stays, draw(4));
+    }
+
+    #[test]
+    fn settings_out_of_range_are_named() {
+        let default = HoldOut::default();
+        let wrong = [
+            (HoldOut { spacing: 1, ..default }, "hold_out.spacing = 1: it must be at least 2"),
+            (HoldOut { gain: 1.0, ..default }, "hold_out.gain = 1: it must be at least 0 and less than 1"),
+            (HoldOut { patience: 1, ..default }, "hold_out.patience = 1: it must be at least 2"),
+            (HoldOut { overshoot: 0.0, ..default }, "hold_out.overshoot = 0: it must be greater than 0"),
+        ];
+        assert!(default.validate().is_ok());
+        for (config, message) in wrong {
+            assert_eq!(config.validate().unwrap_err().to_string(), message);
+        }
     }
 
     #[test]
     fn pixels_held_out_are_hidden_from_the_solver_and_predict_the_error() {
         let shape = VideoShape { frames: 4, height: 64, width: 64 };
-        let h = MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap());
+        let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap()));
         let truth = moving_square(shape);
-        let y = h.forward(truth.view());
-        let problem = Problem::new(&h, y.view()).unwrap();
-        let pixels = HeldOut::new(problem, &HoldOut { spacing: 4, ..HoldOut::default() }).unwrap();
-        let given = pixels.problem().unwrap();
-        let closed = given.operator().gram_diag().iter().filter(|g| **g == 0.0).count();
-        let unopened = h.gram_diag().iter().filter(|g| **g == 0.0).count();
-        assert!(closed > unopened + 200, "{closed}");
+        let full = Measurement::new(h.clone(), h.forward(truth.view())).unwrap();
+        let pixels = HeldOut::new(&full, &HoldOut { spacing: 4, ..HoldOut::default() }).unwrap();
+        let given = pixels.given();
+        let hidden = || Zip::from(given.operator().gram()).and(h.gram()).and(given.y());
+        let count = hidden().fold(0, |n, &given, &full, &y| n + usize::from(given == 0.0 && full > 0.0 && y == 0.0));
+        assert!(count > 200, "{count}");
         assert!(pixels.error(truth.view()) < 1e-12);
-        // Independent errors of known size, here of alternating signs from pixel to pixel and frame to frame.
+        // Independent errors of known size.
         let mut noisy = truth;
         let noise = sci_forward::testing::gaussian(shape.dim(), 5);
         noisy.zip_mut_with(&noise, |x, n| *x += 0.1 * n);
         let predicted = pixels.error(noisy.view());
         // 1 + 1/T of the mean square error: at the pixels that the data step sees, nothing has been projected here.
         assert!((predicted / 0.0125 - 1.0).abs() < 0.15, "{predicted}");
+    }
+
+    /// A better iterate takes the place of the best whole: at the sensor and in RGB.
+    #[test]
+    fn the_best_iterate_is_kept_whole() {
+        let shape = VideoShape { frames: 2, height: 16, width: 16 };
+        let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.9, 1).unwrap()));
+        let truth = moving_square(shape);
+        let full = Measurement::new(h.clone(), h.forward(truth.view())).unwrap();
+        let config = HoldOut { spacing: 4, ..HoldOut::default() };
+        let pixels = HeldOut::new(&full, &config).unwrap();
+        let rgb = |v: f32| ndarray::Array4::from_elem((2, 3, 16, 16), v);
+        let at = |off: f32, rgb| Estimate { sensor: &truth + off, rgb };
+        for iterates in [[at(0.2, None), at(0.1, Some(rgb(1.0)))], [at(0.2, Some(rgb(2.0))), at(0.1, None)]] {
+            let mut judge = Judge::new(&pixels, config, &at(0.5, None));
+            iterates.iter().for_each(|estimate| _ = judge.judge(estimate, false));
+            judge.judge(&at(0.3, Some(rgb(3.0))), false);
+            assert_eq!(judge.into_best().as_ref(), Some(&iterates[1]));
+        }
     }
 }

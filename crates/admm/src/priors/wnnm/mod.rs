@@ -3,7 +3,7 @@
 mod groups;
 mod shrink;
 
-use crate::{BoxError, DenoiseCx, Denoiser};
+use crate::{BoxError, Call, Denoiser};
 use groups::{Grid, Matcher, Place};
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, Zip, s};
 use rayon::prelude::*;
@@ -35,13 +35,13 @@ const AT_ONCE: usize = 1024;
 /// 20 27.83 and 27.93; four frames away 27.85; groups of 48 from 7 pixels away, σ 12 and 6, 27.68 and 27.98.
 ///
 /// ```
-/// use admm::{DenoiseCx, Denoiser, Wnnm};
+/// use admm::{Call, Denoiser, Wnnm};
 /// use ndarray::Array4;
 /// use sci_forward::{VideoShape, testing::{gaussian, moving_square}};
 /// let clean = moving_square(VideoShape { frames: 4, height: 32, width: 32 }).insert_axis(ndarray::Axis(1));
 /// let noisy = &clean + &(gaussian(clean.dim(), 1) * 0.1);
 /// let mut out = Array4::zeros(clean.dim());
-/// Wnnm::default().denoise(&DenoiseCx::new(0.1), noisy.view(), out.view_mut())?;
+/// Wnnm::default().denoise(&Call::new(0.1), noisy.view(), out.view_mut())?;
 /// let error = |v: &Array4<f32>| (v - &clean).mapv(|d| d * d).mean().unwrap();
 /// assert!(error(&out) < error(&noisy) / 8.0);
 /// # Ok::<(), admm::BoxError>(())
@@ -78,12 +78,13 @@ impl Denoiser for Wnnm {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         let (frames, channels, height, width) = noisy.dim();
-        if noisy.is_empty() || cx.sigma <= 0.0 {
+        let sigma = call.required_sigma()?;
+        if noisy.is_empty() || sigma <= 0.0 {
             out.assign(&noisy);
             return Ok(());
         }
@@ -94,7 +95,7 @@ impl Denoiser for Wnnm {
         // For each frame its channels, and how many patches cover a pixel.
         let mut sums = Array4::<f32>::zeros((frames, channels + 1, height, width));
         for some in grid.references().chunks(AT_ONCE) {
-            let shrunk = |some: &[Place]| Shrunk::new(&matcher, &planes, some, cx.sigma);
+            let shrunk = |some: &[Place]| Shrunk::new(&matcher, &planes, some, sigma);
             let groups: Vec<_> = some.par_chunks(GROUPS).map(shrunk).collect();
             // Each frame in the order of the groups: the same sums for any number of threads.
             sums.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(frame, mut sums)| {

@@ -3,11 +3,11 @@
 use crate::HoldOut;
 use std::time::Duration;
 
-/// A number of iterations at one σ.
+/// A number of iterations with one prior at one σ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stage {
-    /// σ given to the denoiser, in units of a frame's full scale; priors with a weight of their own ignore it.
-    pub sigma: f32,
+    /// σ given to the prior, in units of a frame's full scale; nothing for priors with a strength of their own.
+    pub sigma: Option<f32>,
     /// Iterations.
     pub iterations: usize,
 }

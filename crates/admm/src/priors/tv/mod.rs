@@ -4,10 +4,12 @@
 //! step works on the row above. Each step keeps two rows of its dual and of its primal, so that the whole computation stays
 //! in cache, the frame is read once and written once, and no dual plane exists.
 
+mod lanes;
+
 #[cfg(target_arch = "x86_64")]
-use crate::lanes::{Avx2, Avx512};
-use crate::lanes::{Lanes, MAX_LANES, Portable};
-use crate::{BoxError, DenoiseCx, Denoiser};
+use self::lanes::{Avx2, Avx512};
+use self::lanes::{Lanes, MAX_LANES, Portable};
+use crate::{BoxError, Call, Denoiser};
 use ndarray::parallel::prelude::*;
 use ndarray::{ArrayView2, ArrayView4, ArrayViewMut2, ArrayViewMut4, Axis};
 
@@ -120,7 +122,7 @@ impl Denoiser for Tv {
 
     fn denoise(
         &mut self,
-        _: &DenoiseCx,
+        _: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
@@ -132,7 +134,7 @@ impl Denoiser for Tv {
         let group = frames.div_ceil(rayon::current_num_threads());
         self.scratch.resize_with(frames.div_ceil(group), Scratch::default);
         let sweep = if width < self.sweep.lanes { Sweep::SCALAR } else { self.sweep };
-        let call = Call { width, weight: self.weight, inner: self.inner, sweep };
+        let plane = Plane { width, weight: self.weight, inner: self.inner, sweep };
         out.axis_chunks_iter_mut(Axis(0), group)
             .into_par_iter()
             .zip(noisy.axis_chunks_iter(Axis(0), group))
@@ -140,7 +142,7 @@ impl Denoiser for Tv {
             .for_each(|((mut out, noisy), scratch)| {
                 for (mut out, noisy) in out.outer_iter_mut().zip(noisy.outer_iter()) {
                     for (out, noisy) in out.outer_iter_mut().zip(noisy.outer_iter()) {
-                        scratch.denoise(&call, noisy, out);
+                        scratch.denoise(&plane, noisy, out);
                     }
                 }
             });
@@ -148,9 +150,9 @@ impl Denoiser for Tv {
     }
 }
 
-/// What a call has in common for all planes.
+/// What is the same for all planes of a call.
 #[derive(Clone, Copy)]
-struct Call {
+struct Plane {
     width: usize,
     weight: f32,
     inner: usize,
@@ -158,47 +160,47 @@ struct Call {
 }
 
 impl Scratch {
-    fn denoise(&mut self, call: &Call, image: ArrayView2<'_, f32>, mut out: ArrayViewMut2<'_, f32>) {
+    fn denoise(&mut self, plane: &Plane, image: ArrayView2<'_, f32>, mut out: ArrayViewMut2<'_, f32>) {
         // The sub-lattices of a mosaic come as strided views; the sweep works on rows in memory order.
         let image = image.as_standard_layout();
         let image = image.as_slice().expect("a standard layout is a slice");
         match out.as_slice_mut() {
-            Some(out) => self.denoise_plane(call, image, out),
+            Some(out) => self.denoise_plane(plane, image, out),
             None => {
                 let mut packed = std::mem::take(&mut self.packed);
                 packed.resize(image.len(), 0.0);
-                self.denoise_plane(call, image, &mut packed);
+                self.denoise_plane(plane, image, &mut packed);
                 out.iter_mut().zip(&packed).for_each(|(out, v)| *out = *v);
                 self.packed = packed;
             }
         }
     }
 
-    fn denoise_plane(&mut self, call: &Call, image: &[f32], out: &mut [f32]) {
-        let mut steps = call.inner - 1;
-        self.run(call, steps, image, out);
+    fn denoise_plane(&mut self, plane: &Plane, image: &[f32], out: &mut [f32]) {
+        let mut steps = plane.inner - 1;
+        self.run(plane, steps, image, out);
         // The energies are known when the sweep is over. If the steps should have ended early, fewer are swept again:
         // on a video that is still noisy this does not happen.
         if let Some(early) = self.early_end(steps) {
             steps = early;
-            self.run(call, steps, image, out);
+            self.run(plane, steps, image, out);
         }
     }
 
-    fn run(&mut self, call: &Call, steps: usize, image: &[f32], out: &mut [f32]) {
+    fn run(&mut self, plane: &Plane, steps: usize, image: &[f32], out: &mut [f32]) {
         let rows = |length| [Row::zeros(length), Row::zeros(length)];
-        let dual = || rows(FIRST + call.width);
-        if self.width != call.width {
+        let dual = || rows(FIRST + plane.width);
+        if self.width != plane.width {
             self.levels.clear();
-            self.width = call.width;
+            self.width = plane.width;
         }
         self.levels.resize_with(steps + 1, || Level {
             dual: [dual(), dual()],
-            primal: rows(call.width + 1),
+            primal: rows(plane.width + 1),
             energy: 0.0,
         });
         // SAFETY: `Sweep::available` has checked the instruction set; rows have at least a vector's width.
-        unsafe { (call.sweep.run)(&mut self.levels, image, call.width, call.weight, out) }
+        unsafe { (plane.sweep.run)(&mut self.levels, image, plane.width, plane.weight, out) }
     }
 
     /// The number of steps after which the energy had settled, if that is less than `steps`.
@@ -421,7 +423,7 @@ mod tests {
     use sci_forward::VideoShape;
     use sci_forward::testing::{moving_square, uniform};
 
-    const CX: DenoiseCx = DenoiseCx::new(0.0);
+    const CX: Call<'static> = Call::new(0.0);
 
     #[test]
     fn the_fast_path_is_the_definition_at_every_size() {

@@ -1,8 +1,7 @@
 //! What tells a diverged run from a hard one, and what is given back after it.
 
-use crate::Problem;
-use ndarray::{Array3, ArrayView3};
-use sci_forward::Progress;
+use crate::{Estimate, Progress};
+use sci_forward::Measurement;
 
 /// After an estimate this many times closer to the measurement, one that is further from it than a black video has diverged.
 const FALL_BACK: f64 = 10.0;
@@ -23,16 +22,16 @@ pub(crate) struct Guard {
     /// Whether an iterate was admitted.
     iterated: bool,
     /// The best iterate, once another has followed.
-    kept: Option<Array3<f32>>,
+    kept: Option<Estimate>,
 }
 
 impl Guard {
-    pub(crate) fn new(problem: &Problem<'_>, start_residual: f64, limit: f64) -> Self {
-        Self { limit, level: level(problem), best: start_residual, iterated: false, kept: None }
+    pub(crate) fn new(measurement: &Measurement, start_residual: f64, limit: f64) -> Self {
+        Self { limit, level: level(measurement), best: start_residual, iterated: false, kept: None }
     }
 
     /// Takes note of an iterate, `previous` being the one before. False if it has diverged.
-    pub(crate) fn admit(&mut self, residual: f64, change: f64, previous: ArrayView3<'_, f32>) -> bool {
+    pub(crate) fn admit(&mut self, residual: f64, change: f64, previous: &Estimate) -> bool {
         let fell_back = self.iterated && residual > 1.0 && residual > FALL_BACK * self.best;
         if !(residual <= self.limit && change.is_finite()) || fell_back {
             return false;
@@ -41,7 +40,7 @@ impl Guard {
             self.best = residual;
             self.kept = None;
         } else if self.kept.is_none() {
-            self.kept = Some(previous.to_owned());
+            self.kept = Some(previous.clone());
         }
         self.iterated = true;
         true
@@ -52,21 +51,24 @@ impl Guard {
         !self.iterated || (residual <= 1.0 && progress.norm.sqrt() <= TOO_BRIGHT * self.level)
     }
 
-    /// The best iterate with its residual; `last` is the last that was not found to have diverged.
-    pub(crate) fn best(&self, last: ArrayView3<'_, f32>) -> (Array3<f32>, f64) {
-        (self.kept.as_ref().map_or(last, |kept| kept.view()).to_owned(), self.best)
+    /// Makes `current`, the last iterate that was not found to have diverged, the best one; returns its residual.
+    pub(crate) fn restore_best(&self, current: &mut Estimate) -> f64 {
+        if let Some(kept) = &self.kept {
+            current.assign(kept);
+        }
+        self.best
     }
 }
 
 /// How large `‖x‖` is expected to be at most, from the shortest video that has the measurement: `√(B Σ y² / diag(H Hᵀ))` over the
 /// measured pixels, the others taken to be like them. A still scene, and one that is bright in one frame only, are no larger.
-fn level(problem: &Problem<'_>) -> f64 {
-    let (y, gram) = (problem.y(), problem.operator().gram_diag());
+fn level(measurement: &Measurement) -> f64 {
+    let (y, gram) = (measurement.y(), measurement.operator().gram());
     let (sum, count) = ndarray::Zip::from(y).and(gram).fold((0f64, 0usize), |(sum, count), &y, &gram| {
         if gram > 0.0 { (sum + f64::from(y).powi(2) / f64::from(gram), count + 1) } else { (sum, count) }
     });
     let pixels = y.len() as f64;
-    let frames = problem.operator().shape().frames as f64;
+    let frames = measurement.shape().frames as f64;
     // A black measurement has no level of its own: full scale.
     if sum > 0.0 { (frames * sum / count as f64 * pixels).sqrt() } else { (frames * pixels).sqrt() }
 }

@@ -1,9 +1,9 @@
-//! Owns the question which parts of a scene stand still, asked of the measurement alone.
+//! Detects static tiles from one measurement.
 
-use crate::Problem;
-use crate::tiles::Grid;
+use super::tiles::{Grid, SIDE};
 use ndarray::parallel::prelude::*;
 use ndarray::{Array1, Array2, Array3};
+use sci_forward::Measurement;
 
 /// Side of the blocks that are tested.
 const BLOCK: usize = 16;
@@ -12,7 +12,7 @@ const LARGEST_F: f64 = 3.0;
 /// Largest correlation of a still tile.
 const LARGEST_CORRELATION: f64 = 0.12;
 
-/// Which tiles of `side` × `side` pixels stand still, in rows.
+/// Which tiles of 32 × 32 pixels stand still, in rows: what [`Tiles`](crate::Tiles) wants to know.
 ///
 /// Of a scene that stands still, `s = y / Σ_t C_t` is a picture of it, and the difference d of two neighbours in s has
 /// nothing to do with which masks are open there. Where something moves, s is mottled by the masks. With
@@ -23,12 +23,12 @@ const LARGEST_CORRELATION: f64 = 0.12;
 /// * if only its texture moves, `|d|` is larger where `‖w‖` is: the correlation of the two over the tile is at most 0.12.
 ///
 /// Masks that are alike everywhere cannot tell, nor blocks with too few open pixels: such tiles are not called still.
-pub fn still(problem: &Problem<'_>, side: usize) -> Vec<bool> {
-    let (frames, height, width) = problem.operator().shape().dim();
-    let grid = Grid { height, width, side };
-    let masks = problem.operator().adjoint(Array2::ones((height, width)).view());
+pub fn still(measurement: &Measurement) -> Vec<bool> {
+    let (frames, height, width) = measurement.shape().dim();
+    let grid = Grid { height, width, side: SIDE };
+    let masks = measurement.operator().adjoint(Array2::ones((height, width)).view());
     let sum = masks.sum_axis(ndarray::Axis(0));
-    let picture = Picture { masks, sum, problem };
+    let picture = Picture { masks, sum, measurement };
     (0..grid.len())
         .into_par_iter()
         .map(|tile| {
@@ -54,13 +54,13 @@ pub fn still(problem: &Problem<'_>, side: usize) -> Vec<bool> {
         .collect()
 }
 
-struct Picture<'a, 'p> {
+struct Picture<'a> {
     masks: Array3<f32>,
     sum: Array2<f32>,
-    problem: &'a Problem<'p>,
+    measurement: &'a Measurement,
 }
 
-impl Picture<'_, '_> {
+impl Picture<'_> {
     /// d and w of a pixel and its right neighbour, if both are open.
     fn difference(&self, row: usize, column: usize) -> Option<(f64, Array1<f64>)> {
         let (p, q) = ([row, column], [row, column + 1]);
@@ -68,7 +68,7 @@ impl Picture<'_, '_> {
         if sum_p <= 0.0 || sum_q <= 0.0 {
             return None;
         }
-        let d = f64::from(self.problem.y()[p]) / sum_p - f64::from(self.problem.y()[q]) / sum_q;
+        let d = f64::from(self.measurement.y()[p]) / sum_p - f64::from(self.measurement.y()[q]) / sum_q;
         let mask = |at: [usize; 2], t: usize| f64::from(self.masks[[t, at[0], at[1]]]);
         let w = (0..self.masks.dim().0).map(|t| mask(p, t) / sum_p - mask(q, t) / sum_q).collect();
         Some((d, w))
@@ -174,6 +174,7 @@ impl Correlation {
 mod tests {
     use super::*;
     use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+    use std::sync::Arc;
 
     const SHAPE: VideoShape = VideoShape { frames: 8, height: 64, width: 96 };
 
@@ -186,7 +187,7 @@ mod tests {
     fn tiles(video: impl Fn(usize, usize, usize) -> f32) -> Vec<bool> {
         let h = MaskOperator::new(MaskStack::random(SHAPE, 0.5, 2).unwrap());
         let y = h.forward(Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| video(t, i, j)).view());
-        still(&Problem::new(&h, y.view()).unwrap(), 32)
+        still(&Measurement::new(Arc::new(h), y).unwrap())
     }
 
     #[test]
