@@ -1,5 +1,7 @@
 //! Shrinks the singular values of many small matrices at once, one in each lane of a vector.
 
+use multiversion::multiversion;
+
 /// Matrices at once.
 pub(super) const GROUPS: usize = 16;
 
@@ -14,38 +16,6 @@ const SWEEPS: usize = 8;
 
 /// Squared cosine between columns from which on they count as orthogonal.
 const ORTHOGONAL: f32 = 1e-4;
-
-/// A function, compiled for the instruction sets that a machine may have; its arithmetic is the same on each.
-macro_rules! vectorised {
-    ($(#[$doc:meta])* fn $name:ident($($arg:ident: $ty:ty),*) $body:block) => {
-        $(#[$doc])*
-        fn $name($($arg: $ty),*) {
-            #[inline(always)]
-            fn plain($($arg: $ty),*) $body
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx512f")]
-                fn avx512($($arg: $ty),*) {
-                    plain($($arg),*);
-                }
-                #[target_feature(enable = "avx2")]
-                fn avx2($($arg: $ty),*) {
-                    plain($($arg),*);
-                }
-                // SAFETY: the instruction set is there.
-                unsafe {
-                    if is_x86_feature_detected!("avx512f") {
-                        return avx512($($arg),*);
-                    }
-                    if is_x86_feature_detected!("avx2") {
-                        return avx2($($arg),*);
-                    }
-                }
-            }
-            plain($($arg),*);
-        }
-    };
-}
 
 /// Groups of patches, and the products of their pixels.
 pub(super) struct Shrinker {
@@ -110,74 +80,72 @@ impl Shrinker {
     }
 }
 
-vectorised! {
-    /// `Y Yᵀ` of `rest` `[D][padded]` into a lane of `gram` `[D][D]`.
-    fn gram_of(rest: &[f32], padded: usize, lane: usize, gram: &mut [Lanes]) {
-        let pixels = rest.len() / padded;
-        for (k, a) in rest.chunks_exact(padded).enumerate() {
-            for (j, b) in rest.chunks_exact(padded).enumerate().take(k + 1) {
-                let mut sums = [0.0; GROUPS];
-                for (a, b) in a.as_chunks::<GROUPS>().0.iter().zip(b.as_chunks::<GROUPS>().0) {
-                    for l in 0..GROUPS {
-                        sums[l] += a[l] * b[l];
-                    }
+/// `Y Yᵀ` of `rest` `[D][padded]` into a lane of `gram` `[D][D]`.
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
+fn gram_of(rest: &[f32], padded: usize, lane: usize, gram: &mut [Lanes]) {
+    let pixels = rest.len() / padded;
+    for (k, a) in rest.chunks_exact(padded).enumerate() {
+        for (j, b) in rest.chunks_exact(padded).enumerate().take(k + 1) {
+            let mut sums = [0.0; GROUPS];
+            for (a, b) in a.as_chunks::<GROUPS>().0.iter().zip(b.as_chunks::<GROUPS>().0) {
+                for l in 0..GROUPS {
+                    sums[l] += a[l] * b[l];
                 }
-                let sum = sums.iter().sum();
-                (gram[k * pixels + j][lane], gram[j * pixels + k][lane]) = (sum, sum);
             }
+            let sum = sums.iter().sum();
+            (gram[k * pixels + j][lane], gram[j * pixels + k][lane]) = (sum, sum);
         }
     }
 }
 
-vectorised! {
-    /// `filter = V diag(ŝ / s) Vᵀ` with `gram = V diag(s²) Vᵀ`, both `[D][D]`; s is shrunk to 0 where s² is not above `least`.
-    ///
-    /// One-sided Jacobi rotations make the columns of `gram` orthogonal: they become s² V, the largest first. Eigenvectors that are shrunk
-    /// away need not be exact: once a sweep has gathered what is strong in the first columns, pairs of weak ones are left alone.
-    fn filters(gram: &mut [Lanes], pixels: usize, least: &Lanes, filter: &mut [Lanes]) {
-        let mut weak = [0f32; GROUPS];
-        for (weak, least) in weak.iter_mut().zip(least) {
-            *weak = 0.25 * least * least;
+/// `filter = V diag(ŝ / s) Vᵀ` with `gram = V diag(s²) Vᵀ`, both `[D][D]`; s is shrunk to 0 where s² is not above `least`.
+///
+/// One-sided Jacobi rotations make the columns of `gram` orthogonal: they become s² V, the largest first. Eigenvectors that are shrunk
+/// away need not be exact: once a sweep has gathered what is strong in the first columns, pairs of weak ones are left alone.
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
+fn filters(gram: &mut [Lanes], pixels: usize, least: &Lanes, filter: &mut [Lanes]) {
+    let mut weak = [0f32; GROUPS];
+    for (weak, least) in weak.iter_mut().zip(least) {
+        *weak = 0.25 * least * least;
+    }
+    let mut norms = vec![[0.0; GROUPS]; pixels];
+    for sweep in 0..SWEEPS {
+        for (column, norm) in gram.chunks_exact(pixels).zip(&mut norms) {
+            *norm = dot(column, column);
         }
-        let mut norms = vec![[0.0; GROUPS]; pixels];
-        for sweep in 0..SWEEPS {
-            for (column, norm) in gram.chunks_exact(pixels).zip(&mut norms) {
-                *norm = dot(column, column);
-            }
-            let mut worst = [0f32; GROUPS];
-            for q in 1..pixels {
-                let (before, from_q) = gram.split_at_mut(q * pixels);
-                let (norms_before, norms_from_q) = norms.split_at_mut(q);
-                let columns = before.chunks_exact_mut(pixels).zip(norms_before);
-                for (p, a) in columns {
-                    let b = &mut norms_from_q[0];
-                    if sweep == 0 || any_above(a, b, &weak) {
-                        rotate((p, a), (&mut from_q[..pixels], b), &weak, &mut worst);
-                    }
+        let mut worst = [0f32; GROUPS];
+        for q in 1..pixels {
+            let (before, from_q) = gram.split_at_mut(q * pixels);
+            let (norms_before, norms_from_q) = norms.split_at_mut(q);
+            let columns = before.chunks_exact_mut(pixels).zip(norms_before);
+            for (p, a) in columns {
+                let b = &mut norms_from_q[0];
+                if sweep == 0 || any_above(a, b, &weak) {
+                    rotate((p, a), (&mut from_q[..pixels], b), &weak, &mut worst);
                 }
             }
-            if worst.iter().all(|&w| w <= ORTHOGONAL) {
-                break;
-            }
         }
-        filter.fill([0.0; GROUPS]);
-        for column in gram.chunks_exact(pixels) {
-            let norm = dot(column, column);
-            let mut scale = [0f32; GROUPS];
-            for l in 0..GROUPS {
-                // The square of s⁴ is `norm`.
-                let square = norm[l].sqrt();
-                let kept = 0.5 + 0.5 * (1.0 - (least[l] / square).min(1.0)).sqrt();
-                scale[l] = if square > least[l] { kept / norm[l] } else { 0.0 };
-            }
-            if scale == [0.0; GROUPS] {
-                continue;
-            }
-            for (row, &a) in filter.chunks_exact_mut(pixels).zip(column) {
-                for (w, b) in row.iter_mut().zip(column) {
-                    for l in 0..GROUPS {
-                        w[l] += scale[l] * a[l] * b[l];
-                    }
+        if worst.iter().all(|&w| w <= ORTHOGONAL) {
+            break;
+        }
+    }
+    filter.fill([0.0; GROUPS]);
+    for column in gram.chunks_exact(pixels) {
+        let norm = dot(column, column);
+        let mut scale = [0f32; GROUPS];
+        for l in 0..GROUPS {
+            // The square of s⁴ is `norm`.
+            let square = norm[l].sqrt();
+            let kept = 0.5 + 0.5 * (1.0 - (least[l] / square).min(1.0)).sqrt();
+            scale[l] = if square > least[l] { kept / norm[l] } else { 0.0 };
+        }
+        if scale == [0.0; GROUPS] {
+            continue;
+        }
+        for (row, &a) in filter.chunks_exact_mut(pixels).zip(column) {
+            for (w, b) in row.iter_mut().zip(column) {
+                for l in 0..GROUPS {
+                    w[l] += scale[l] * a[l] * b[l];
                 }
             }
         }
@@ -213,7 +181,8 @@ fn rotate((p, a): (&mut [Lanes], &mut Lanes), (q, b): (&mut [Lanes], &mut Lanes)
     // The new columns are x p + y q and z p + w q.
     let [mut x, mut y, mut z, mut w] = [[0f32; GROUPS]; 4];
     for l in 0..GROUPS {
-        let cosine = c[l] * c[l] / (a[l] * b[l]).max(f32::MIN_POSITIVE);
+        // A quotient at a time: with a σ close to 0 the product of both norms would leave the range of numbers.
+        let cosine = (c[l] / a[l].max(f32::MIN_POSITIVE)) * (c[l] / b[l].max(f32::MIN_POSITIVE));
         let turns = cosine > 1e-12;
         let zeta = (b[l] - a[l]) / (2.0 * if turns { c[l] } else { 1.0 });
         let t = 1f32.copysign(zeta) / (zeta.abs() + (1.0 + zeta * zeta).sqrt());
@@ -239,15 +208,14 @@ fn rotate((p, a): (&mut [Lanes], &mut Lanes), (q, b): (&mut [Lanes], &mut Lanes)
     }
 }
 
-vectorised! {
-    /// `result = filter · rest`, of one lane.
-    fn apply(filter: &[Lanes], lane: usize, rest: &[f32], padded: usize, result: &mut [f32]) {
-        let pixels = rest.len() / padded;
-        for (filter, result) in filter.chunks_exact(pixels).zip(result.chunks_exact_mut(padded)) {
-            for (w, row) in filter.iter().zip(rest.chunks_exact(padded)) {
-                let w = w[lane];
-                result.iter_mut().zip(row).for_each(|(r, x)| *r += w * x);
-            }
+/// `result = filter · rest`, of one lane.
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
+fn apply(filter: &[Lanes], lane: usize, rest: &[f32], padded: usize, result: &mut [f32]) {
+    let pixels = rest.len() / padded;
+    for (filter, result) in filter.chunks_exact(pixels).zip(result.chunks_exact_mut(padded)) {
+        for (w, row) in filter.iter().zip(rest.chunks_exact(padded)) {
+            let w = w[lane];
+            result.iter_mut().zip(row).for_each(|(r, x)| *r += w * x);
         }
     }
 }
@@ -284,6 +252,16 @@ mod tests {
             let expected = matrix(shrunk, m, k) + lane as f64;
             assert!((f64::from(found) - expected).abs() < 2e-4, "{lane} {m} {k}: {found} {expected}");
         }
+    }
+
+    /// Far below any noise the formula leaves a matrix as it is, although squares of squares of it in units of σ are huge.
+    #[test]
+    fn next_to_no_noise_changes_nothing() {
+        let patches = gaussian((48, 36), 3);
+        let mut shrinker = Shrinker::new(36, 0.001 / 255.0);
+        shrinker.take(48, |m, k| patches[[m, k]]);
+        let worst = shrinker.shrunk().iter().zip(&patches).fold(0f32, |worst, (v, x)| worst.max((v - x).abs()));
+        assert!(worst < 1e-3, "{worst}");
     }
 
     #[test]
