@@ -1,6 +1,6 @@
 //! Whole passes and training steps: 8 frames of 256×256 through each denoiser, one step of FFDNet on 16 patches.
 
-use admm::{DenoiseCx, Denoiser};
+use admm::{Call, Denoiser};
 use criterion::{Criterion, criterion_group, criterion_main};
 use ndarray::Array4;
 use nets::train::{
@@ -13,8 +13,8 @@ fn pass(c: &mut Criterion, name: &str, net: &mut dyn Denoiser, channels: usize) 
     let video =
         Array4::from_shape_fn((8, channels, 256, 256), |(t, c, y, x)| ((t + c + 5 * y + 3 * x) % 17) as f32 / 17.0);
     let mut out = Array4::zeros(video.dim());
-    let cx = DenoiseCx::new(0.1);
-    c.bench_function(name, |b| b.iter(|| net.denoise(&cx, video.view(), out.view_mut()).expect("shapes fit")));
+    let call = Call::new(0.1);
+    c.bench_function(name, |b| b.iter(|| net.denoise(&call, video.view(), out.view_mut()).expect("shapes fit")));
 }
 
 fn passes(c: &mut Criterion) {

@@ -173,6 +173,10 @@ impl Network for Ddnet {
 }
 
 impl Demosaicer for Ddnet {
+    fn name(&self) -> &str {
+        "ddnet"
+    }
+
     fn demosaic(
         &mut self,
         cfa: CfaPattern,

@@ -12,7 +12,7 @@ use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
-use admm::{BoxError, DenoiseCx, Denoiser};
+use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use ndarray::{ArrayView4, ArrayViewMut4};
 use rand::SeedableRng;
@@ -198,19 +198,20 @@ impl Denoiser for Fastdvdnet {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        check_video(self, cx.sigma, noisy, &out)?;
+        let sigma = call.required_sigma()?;
+        check_video(self, sigma, noisy, &out)?;
         if noisy.is_empty() {
             return Ok(());
         }
         let device = self.device();
         if device.is_cpu() {
-            self.net.infer(noisy, cx.sigma, out)?;
+            self.net.infer(noisy, sigma, out)?;
         } else {
-            let clean = self.forward(&to_tensor(noisy, &device)?, &[cx.sigma])?;
+            let clean = self.forward(&to_tensor(noisy, &device)?, &[sigma])?;
             copy_to(&clean, out).map_err(Error::from)?;
         }
         Ok(())

@@ -18,7 +18,7 @@ use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
-use admm::{BoxError, DenoiseCx, Denoiser};
+use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
 use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, s};
@@ -276,20 +276,21 @@ impl Denoiser for Ffdnet {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
-        check_video(self, cx.sigma, noisy, &out)?;
+        let sigma = call.required_sigma()?;
+        check_video(self, sigma, noisy, &out)?;
         if noisy.is_empty() {
             return Ok(());
         }
         let device = self.device();
         for (frame, out) in noisy.outer_iter().zip(out.outer_iter_mut()) {
             if device.is_cpu() {
-                self.infer(frame, cx.sigma, out)?;
+                self.infer(frame, sigma, out)?;
             } else {
-                let clean = self.forward(&to_tensor(frame.insert_axis(Axis(0)), &device)?, &[cx.sigma])?;
+                let clean = self.forward(&to_tensor(frame.insert_axis(Axis(0)), &device)?, &[sigma])?;
                 copy_to(&clean, out.insert_axis(Axis(0))).map_err(Error::from)?;
             }
         }

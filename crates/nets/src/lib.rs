@@ -2,15 +2,14 @@
 //! CPU convolution kernels of their own.
 //!
 //! ```
-//! use admm::{DenoiseCx, Denoiser};
+//! use admm::{Call, Denoiser};
 //! use nets::{Ffdnet, FfdnetSpec, Network};
 //! use ndarray::Array4;
 //!
 //! let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0)?;
 //! let noisy = Array4::from_elem((2, 1, 9, 7), 0.5);
 //! let mut clean = Array4::zeros(noisy.dim());
-//! let cx = DenoiseCx::new(25.0 / 255.0);
-//! net.denoise(&cx, noisy.view(), clean.view_mut())?;
+//! net.denoise(&Call::new(25.0 / 255.0), noisy.view(), clean.view_mut())?;
 //! assert_eq!(net.describe(), "FFDNet (gray, 8 channels, 3 layers)");
 //! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
 //! ```
@@ -19,12 +18,12 @@ mod ddnet;
 mod error;
 mod fastdvdnet;
 mod ffdnet;
-mod frugal;
 #[cfg(test)]
 mod gradient_tests;
 mod infer;
 pub mod kernels;
 mod layers;
+mod mixed_precision;
 mod network;
 pub mod train;
 mod video;
@@ -34,8 +33,8 @@ pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};
 pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};
 pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
-pub use frugal::{Frugal, HalfCounts, Precise};
 pub use layers::Parameters;
+pub use mixed_precision::{MixedPrecision, PrecisionCounter, PrecisionCounts, SelectPrecision};
 pub use network::{Network, Window};
 pub use video::Ends;
 pub use weights::WeightFile;

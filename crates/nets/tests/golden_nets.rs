@@ -1,6 +1,6 @@
 //! The networks against outputs of public PyTorch implementations, with the published weights.
 
-use admm::{DenoiseCx, Denoiser};
+use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array0, Array4, ArrayD, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
@@ -30,7 +30,7 @@ impl Golden {
 
 fn denoise(net: &mut dyn Denoiser, noisy: &Array4<f32>, sigma: f32) -> Array4<f32> {
     let mut out = Array4::from_elem(noisy.dim(), f32::NAN);
-    net.denoise(&DenoiseCx::new(sigma), noisy.view(), out.view_mut()).unwrap();
+    net.denoise(&Call::new(sigma), noisy.view(), out.view_mut()).unwrap();
     out
 }
 

@@ -1,13 +1,13 @@
 //! Behaviour of the networks that needs no published weights.
 
-use admm::{DenoiseCx, Denoiser};
+use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array3, Array4, Axis, concatenate, s};
 use nets::kernels::{Isa, Precision};
 use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Frugal, Network,
-    WeightFile,
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, MixedPrecision,
+    Network, WeightFile,
 };
 use sci_forward::bayer::{Malvar, mosaic_into};
 use sci_forward::testing::{gaussian, shared_file};
@@ -18,7 +18,8 @@ use std::path::{Path, PathBuf};
 trait NetworkDenoiser: Network + Denoiser {}
 impl<N: Network + Denoiser> NetworkDenoiser for N {}
 
-const CX: DenoiseCx = DenoiseCx::new(0.1);
+const SIGMA: f32 = 0.1;
+const CALL: Call<'_> = Call::new(SIGMA);
 
 fn pattern(dim: (usize, usize, usize, usize)) -> Array4<f32> {
     Array4::from_shape_fn(dim, |(t, c, y, x)| ((13 * t + 7 * c + 5 * y + 3 * x) % 23) as f32 / 23.0)
@@ -38,14 +39,14 @@ fn tiny_ddnet() -> Ddnet {
 
 fn denoise(net: &mut dyn Denoiser, video: &Array4<f32>) -> Array4<f32> {
     let mut out = Array4::from_elem(video.dim(), f32::NAN);
-    net.denoise(&CX, video.view(), out.view_mut()).unwrap();
+    net.denoise(&CALL, video.view(), out.view_mut()).unwrap();
     out
 }
 
 /// The differentiable pass, which works on whole tensors.
 fn by_tensors(net: &dyn Network, video: &Array4<f32>) -> Array4<f32> {
     let x = Tensor::from_slice(video.as_slice().unwrap(), video.dim(), &Device::Cpu).unwrap();
-    let y = net.forward(&x, &[CX.sigma]).unwrap();
+    let y = net.forward(&x, &[SIGMA]).unwrap();
     Array4::from_shape_vec(video.dim(), y.flatten_all().unwrap().to_vec1().unwrap()).unwrap()
 }
 
@@ -152,14 +153,14 @@ fn bf16_is_for_calls_that_tolerate_its_error() {
     let error = (difference.sum() / difference.len() as f64).sqrt() as f32;
     let on_amx = Isa::detect().unwrap() == Isa::Amx;
     for (tolerance, halved) in [(0.0, false), (0.9 * error, false), (1.1 * error, true)] {
-        let counts = std::rc::Rc::default();
-        let mut frugal = Frugal::new(&mut net, std::rc::Rc::clone(&counts));
+        let mut mixed = MixedPrecision::new(&mut net);
+        let counter = mixed.counter();
         for _ in 0..2 {
             let mut out = Array4::zeros(video.dim());
-            frugal.denoise(&DenoiseCx { tolerance, ..CX }, video.view(), out.view_mut()).unwrap();
+            mixed.denoise(&Call { tolerance, ..CALL }, video.view(), out.view_mut()).unwrap();
             assert!(out == if halved { &rounded } else { &exact }, "tolerance {tolerance}, error {error}");
         }
-        assert_eq!(counts.get().share(), f64::from(u8::from(halved && on_amx)));
+        assert_eq!(counter.counts().share(), f64::from(u8::from(halved && on_amx)));
     }
 }
 
@@ -222,14 +223,15 @@ fn nan_and_infinity_pass_through_without_a_crash() {
 fn wrong_channels_shapes_and_noise_levels_are_refused_by_name() {
     let rgb = pattern((2, 3, 4, 4));
     let mut out = Array4::zeros(rgb.dim());
-    let error = tiny_ffdnet(1).denoise(&CX, rgb.view(), out.view_mut()).unwrap_err().to_string();
+    let error = tiny_ffdnet(1).denoise(&CALL, rgb.view(), out.view_mut()).unwrap_err().to_string();
     assert_eq!(error, "FFDNet (gray, 6 channels, 3 layers) takes videos of 1 channel(s), this one has 3");
     let mut small = Array4::zeros((2, 3, 4, 3));
-    let error = tiny_fastdvdnet(3, Ends::Circular).denoise(&CX, rgb.view(), small.view_mut()).unwrap_err().to_string();
+    let error =
+        tiny_fastdvdnet(3, Ends::Circular).denoise(&CALL, rgb.view(), small.view_mut()).unwrap_err().to_string();
     assert!(error.contains("[2, 3, 4, 4]") && error.contains("[2, 3, 4, 3]"), "{error}");
     for sigma in [-1.0, f32::NAN] {
-        let cx = DenoiseCx { sigma, ..CX };
-        let error = tiny_ffdnet(3).denoise(&cx, rgb.view(), out.view_mut()).unwrap_err().to_string();
+        let call = Call { sigma: Some(sigma), ..CALL };
+        let error = tiny_ffdnet(3).denoise(&call, rgb.view(), out.view_mut()).unwrap_err().to_string();
         assert!(error.contains("noise level"), "{error}");
     }
     let mosaic = Array3::zeros((2, 4, 5));
@@ -417,7 +419,7 @@ fn lowers_the_noise<N: Network + Denoiser>(name: &str, net: &mut N) {
     let channels = net.channels();
     let ramp = |(t, c, y, x): (usize, usize, usize, usize)| 0.2 + 0.01 * (y + t) as f32 + 0.005 * (x + c) as f32;
     let clean = Array4::from_shape_fn((6, channels, 48, 48), ramp);
-    let noisy = &clean + &(&gaussian(clean.dim(), 7) * CX.sigma);
+    let noisy = &clean + &(&gaussian(clean.dim(), 7) * SIGMA);
     let error = |video: &Array4<f32>| (video - &clean).mapv(|v| v * v).mean().unwrap();
     let (before, after) = (error(&noisy), error(&denoise(net, &noisy)));
     // White noise of this σ is not what a net for iterates was trained on, of which the test of unseen masks is the judge.

@@ -28,8 +28,8 @@ pub(super) const SLACK: usize = 96;
 
 /// One image of any number of channels as `[⌈C/16⌉][1 + ⌈H⌉₄ + 1][1 + ⌈W⌉₄ + 1][16]` (`⌈·⌉₄`: up to a multiple of 4).
 ///
-/// For the matrix unit two blocks hold 32 channels as pairs of bf16 numbers instead ([`Form::Split`]), or one block 32 as bf16
-/// ([`Form::Half`]).
+/// For the matrix unit two blocks hold 32 channels as pairs of bf16 numbers instead (`Form::Split`), or one block 32 as bf16
+/// (`Form::Half`).
 ///
 /// The border is zero, so that a 3×3 filter, or a Winograd tile of 6×6, never has to look where it is. The lanes beyond
 /// the last channel hold nothing: kernels write zeros there and never read them.

@@ -3,30 +3,32 @@
 
 use super::config::IteratesConfig;
 use crate::{Error, Result};
-use admm::{BoxError, Demosaicked, DenoiseCx, Denoiser, Flips, Gap, Plan, Problem, SolveError, Stage, Start, run};
+use admm::{
+    BoxError, Call, Demosaicked, Denoiser, Flips, Gap, PerLattice, Plan, Prior, SolveError, Solver, Stage, Start, Tv,
+    run,
+};
 use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use rand::{Rng, RngExt};
 use sci_forward::bayer::{Menon, mosaic_into};
-use sci_forward::{CfaPattern, MaskError, MaskOperator, MaskStack, SensingOperator, VideoShape};
+use sci_forward::{CfaPattern, Demosaicer, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+use std::fmt::Display;
+use std::sync::Arc;
 
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
 const START_WEIGHT: f32 = 0.1;
 
-/// A call of the denoiser.
-pub(super) struct Call {
+/// A call of the denoiser in a solve.
+pub(super) struct RecordedCall {
     /// What it is given, `[T, C, H, W]`, the right way round.
     pub(super) input: Array4<f32>,
     pub(super) sigma: f32,
     pub(super) iteration: usize,
 }
 
-/// A measurement and what made it.
+/// A measurement of a training clip.
 #[derive(Clone)]
 pub(super) struct Simulated {
-    operator: MaskOperator,
-    y: Array2<f32>,
-    /// The pattern of a color sensor.
-    cfa: Option<CfaPattern>,
+    measurement: Measurement,
 }
 
 impl Simulated {
@@ -35,23 +37,15 @@ impl Simulated {
     pub(super) fn random(clip: ArrayView4<'_, f32>, settings: &IteratesConfig, rng: &mut impl Rng) -> Result<Self> {
         let (frames, channels, height, width) = clip.dim();
         let shape = VideoShape { frames, height, width };
-        let [low, high] = settings.density;
-        let density = low + (high - low) * rng.random::<f64>();
-        let masks = if rng.random::<f64>() < settings.gray_masks {
-            MaskStack::new(Array3::from_shape_simple_fn(shape.dim(), || rng.random()))
-        } else {
-            MaskStack::random(shape, density, rng.random())
-        };
-        let unusable = |e: MaskError| Error::Data(e.to_string());
-        let mut masks = masks.map_err(unusable)?;
-        if settings.holes > 0.0 {
+        let masks = random_masks(shape, settings, rng)?;
+        let measured = (settings.holes > 0.0).then(|| {
             let share = settings.holes * rng.random::<f64>();
-            let measured = Array2::from_shape_simple_fn((height, width), || rng.random::<f64>() >= share);
-            masks = masks.restricted_to(measured.view()).map_err(unusable)?;
-        }
-        let operator = MaskOperator::new(masks);
+            Array2::from_shape_simple_fn((height, width), || rng.random::<f64>() >= share)
+        });
+        // Drawn for gray clips too: what is drawn next does not depend on the color.
         let pattern = CfaPattern::ALL[rng.random_range(0..4)];
         let cfa = (channels == 3).then_some(pattern);
+        let operator = Arc::new(MaskOperator::new(masks));
         let y = match cfa {
             None => operator.forward(clip.index_axis(Axis(1), 0)),
             Some(cfa) => {
@@ -60,17 +54,16 @@ impl Simulated {
                 operator.forward(mosaic.view())
             }
         };
-        Ok(Self { operator, y, cfa })
+        let whole = Measurement::new(operator, y).map_err(unusable)?.with_cfa(cfa);
+        let measurement = match measured {
+            None => whole,
+            Some(measured) => whole.restricted(measured.view()).map_err(unusable)?,
+        };
+        Ok(Self { measurement })
     }
 
-    /// H.
-    pub(super) fn operator(&self) -> &MaskOperator {
-        &self.operator
-    }
-
-    /// The pattern of a color sensor.
-    pub(super) fn cfa(&self) -> Option<CfaPattern> {
-        self.cfa
+    pub(super) fn measurement(&self) -> &Measurement {
+        &self.measurement
     }
 
     /// What the solver gives the denoiser in some of its calls, drawn anew. Iterates of one clip are much
@@ -83,7 +76,7 @@ impl Simulated {
         settings: &IteratesConfig,
         denoiser: &mut dyn Denoiser,
         rng: &mut impl Rng,
-    ) -> Result<Vec<Call>> {
+    ) -> Result<Vec<RecordedCall>> {
         let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
         calls.sort_unstable();
         self.record(settings, denoiser, calls)
@@ -98,13 +91,18 @@ impl Simulated {
         settings: &IteratesConfig,
         denoiser: &mut dyn Denoiser,
         rng: &mut impl Rng,
-    ) -> Result<Vec<Call>> {
+    ) -> Result<Vec<RecordedCall>> {
         let first = rng.random_range(0..=settings.sigmas.len() - settings.calls);
         self.record(settings, denoiser, (first..first + settings.calls).collect())
     }
 
     /// The denoiser sees the video another way round in every call, as in the configurations that networks are trained for.
-    fn record(&self, settings: &IteratesConfig, denoiser: &mut dyn Denoiser, calls: Vec<usize>) -> Result<Vec<Call>> {
+    fn record(
+        &self,
+        settings: &IteratesConfig,
+        denoiser: &mut dyn Denoiser,
+        calls: Vec<usize>,
+    ) -> Result<Vec<RecordedCall>> {
         let last = calls.last().copied().unwrap_or(0);
         let mut recorder = Recorder { denoiser: Flips::new(denoiser), calls, seen: Vec::new() };
         self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;
@@ -122,30 +120,53 @@ impl Simulated {
         start_iterations: usize,
         denoiser: &mut dyn Denoiser,
     ) -> Result<Array4<f32>> {
-        let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: s / 255.0, iterations: 1 }).collect();
-        let plan = Plan::new(stages);
-        let problem = Problem::new(&self.operator, self.y.view()).map_err(typed)?;
+        let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: Some(s / 255.0), iterations: 1 }).collect();
+        let cfa = self.measurement.cfa();
+        let tv = Tv::new(START_WEIGHT);
+        let mut warm_up: Box<dyn Prior> = if cfa.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) };
         let start = match start_iterations {
             0 => Start::Mean,
-            iterations => Start::Tv { iterations, weight: START_WEIGHT, bayer: self.cfa.is_some() },
+            iterations => Start::Warm { prior: &mut *warm_up, stage: Stage { sigma: None, iterations } },
         };
-        let outcome = match self.cfa {
-            None => run(&mut Gap::accelerated(denoiser), &problem, start, &plan, &mut ()),
-            Some(cfa) => {
-                let mut gap = Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa));
-                run(&mut gap, &problem, start, &plan, &mut ())
+        let mut solver: Box<dyn Solver + '_> = match cfa {
+            None => Box::new(Gap::accelerated(denoiser)),
+            Some(cfa) => Box::new(Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa))),
+        };
+        let outcome = run(&mut *solver, &self.measurement, start, &Plan::new(stages), &mut ()).map_err(typed)?;
+        // The start, to which a divergence goes back, has no RGB video.
+        match (outcome.estimate.rgb, cfa) {
+            (Some(rgb), _) => Ok(rgb),
+            (None, None) => Ok(outcome.estimate.sensor.insert_axis(Axis(1))),
+            (None, Some(cfa)) => {
+                let (frames, height, width) = outcome.estimate.sensor.dim();
+                let mut rgb = Array4::zeros((frames, 3, height, width));
+                Menon.demosaic(cfa, outcome.estimate.sensor.view(), rgb.view_mut()).map_err(unusable)?;
+                Ok(rgb)
             }
-        };
-        let outcome = outcome.map_err(typed)?;
-        Ok(outcome.rgb.unwrap_or_else(|| outcome.estimate.insert_axis(Axis(1))))
+        }
     }
+}
+
+fn random_masks(shape: VideoShape, settings: &IteratesConfig, rng: &mut impl Rng) -> Result<MaskStack> {
+    let [low, high] = settings.density;
+    let density = low + (high - low) * rng.random::<f64>();
+    let masks = if rng.random::<f64>() < settings.gray_masks {
+        MaskStack::new(Array3::from_shape_simple_fn(shape.dim(), || rng.random()))
+    } else {
+        MaskStack::random(shape, density, rng.random())
+    };
+    masks.map_err(unusable)
+}
+
+fn unusable(error: impl Display) -> Error {
+    Error::Data(error.to_string())
 }
 
 /// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
 struct Recorder<'d> {
     denoiser: Flips<&'d mut dyn Denoiser>,
     calls: Vec<usize>,
-    seen: Vec<Call>,
+    seen: Vec<RecordedCall>,
 }
 
 impl Denoiser for Recorder<'_> {
@@ -155,19 +176,19 @@ impl Denoiser for Recorder<'_> {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         mut out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
-        if self.calls.contains(&cx.iteration) {
+        if self.calls.contains(&call.iteration) {
             let input = noisy.as_standard_layout().into_owned();
-            self.seen.push(Call { input, sigma: cx.sigma, iteration: cx.iteration });
+            self.seen.push(RecordedCall { input, sigma: call.required_sigma()?, iteration: call.iteration });
         }
         if self.seen.len() == self.calls.len() {
             out.assign(&noisy);
             return Ok(());
         }
-        self.denoiser.denoise(cx, noisy, out)
+        self.denoiser.denoise(call, noisy, out)
     }
 }
 
@@ -175,8 +196,57 @@ impl Denoiser for Recorder<'_> {
 fn typed(error: SolveError) -> Error {
     let text = error.to_string();
     let source: Option<BoxError> = match error {
-        SolveError::Denoiser { source, .. } => Some(source),
+        SolveError::Prior { source, .. } => Some(source),
         _ => None,
     };
     source.and_then(|s| s.downcast::<Error>().ok()).map_or(Error::Data(text), |e| *e)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    struct Broken;
+
+    impl Denoiser for Broken {
+        fn name(&self) -> &str {
+            "broken"
+        }
+
+        fn denoise(
+            &mut self,
+            _: &Call<'_>,
+            _: ArrayView4<'_, f32>,
+            mut out: ArrayViewMut4<'_, f32>,
+        ) -> std::result::Result<(), BoxError> {
+            out.fill(f32::NAN);
+            Ok(())
+        }
+    }
+
+    /// Validation goes on with a network that has gone astray.
+    #[test]
+    fn a_solve_that_diverges_has_a_finite_result_of_the_clips_size() {
+        let settings = IteratesConfig {
+            sigmas: vec![40.0, 20.0],
+            calls: 1,
+            unrolled: false,
+            start_iterations: 2,
+            frames: [2, 2],
+            density: [0.5, 0.5],
+            gray_masks: 0.0,
+            holes: 0.1,
+        };
+        for channels in [1, 3] {
+            let clip =
+                Array4::from_shape_fn((2, channels, 8, 10), |(t, c, y, x)| ((t + 2 * c + y + x) % 7) as f32 / 7.0);
+            let rng = &mut ChaCha8Rng::seed_from_u64(1);
+            let simulated = Simulated::random(clip.view(), &settings, rng).unwrap();
+            let result = simulated.solve(&settings.sigmas, settings.start_iterations, &mut Broken).unwrap();
+            assert_eq!(result.dim(), clip.dim());
+            assert!(result.iter().all(|v| v.is_finite()));
+        }
+    }
 }

@@ -5,7 +5,7 @@ use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
 use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
-use super::iterates::{Call, Simulated};
+use super::iterates::{RecordedCall, Simulated};
 use super::noise::{add_noise, sensor};
 use super::revive::{Idle, State};
 use super::unrolled::Unrolled;
@@ -13,7 +13,7 @@ use crate::kernels::with_numbers;
 use crate::layers::Conv;
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
-use admm::{DenoiseCx, Denoiser, Flips};
+use admm::{Call, Denoiser, Flips};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
@@ -104,8 +104,7 @@ impl Model {
     /// Runs the network without gradients.
     fn restore(&mut self, input: ArrayView4<'_, f32>, sigma: f32) -> Result<Array4<f32>> {
         let mut out = Array4::zeros(input.dim());
-        let cx = DenoiseCx::new(sigma);
-        self.denoise(&cx, input, out.view_mut()).map_err(|e| Error::Data(e.to_string()))?;
+        self.denoise(&Call::new(sigma), input, out.view_mut()).map_err(|e| Error::Data(e.to_string()))?;
         Ok(out)
     }
 }
@@ -219,13 +218,13 @@ impl Denoiser for Model {
 
     fn denoise(
         &mut self,
-        cx: &DenoiseCx,
+        call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), admm::BoxError> {
         match self {
-            Self::Ffdnet(net) => net.denoise(cx, noisy, out),
-            Self::Fastdvdnet(net) => net.denoise(cx, noisy, out),
+            Self::Ffdnet(net) => net.denoise(call, noisy, out),
+            Self::Fastdvdnet(net) => net.denoise(call, noisy, out),
             Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
         }
     }
@@ -339,7 +338,7 @@ impl Trainer {
                 return Ok(vec![Lesson::Unrolled(Box::new(Unrolled { simulated, clean, calls }))]);
             }
             let calls = simulated.iterates(settings, &mut model, &mut rng)?;
-            let lesson = |Call { input, sigma, .. }| {
+            let lesson = |RecordedCall { input, sigma, .. }| {
                 Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(input)?, sigmas: vec![sigma] }))
             };
             calls.into_iter().map(lesson).collect::<Result<Vec<_>>>()

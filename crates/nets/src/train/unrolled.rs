@@ -5,20 +5,20 @@
 //! nearest samples by the curvature of the color that was seen, Menon in one direction and Malvar in both.
 
 use super::config::Loss;
-use super::iterates::{Call, Simulated};
+use super::iterates::{RecordedCall, Simulated};
 use super::step::{Gradients, tensor};
 use crate::{Error, Network, Result};
 use admm::flipped_axes;
 use candle_core::{Tensor, Var};
 use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
+use sci_forward::SensingOperator;
 use sci_forward::bayer::{Malvar, mosaic_adjoint_into};
-use sci_forward::{MaskOperator, SensingOperator};
 
 /// Consecutive calls of a solver, and the truth.
 pub(super) struct Unrolled {
     pub simulated: Simulated,
     pub clean: Tensor,
-    pub calls: Vec<Call>,
+    pub calls: Vec<RecordedCall>,
 }
 
 impl Unrolled {
@@ -26,11 +26,10 @@ impl Unrolled {
     /// user gets, and its gradient for each of `vars`. Goes backward call by call, each run
     /// again with its graph, so that the memory is that of one.
     pub(super) fn gradient(&self, network: &dyn Network, vars: &[(String, Var)], loss: Loss) -> Result<Gradients> {
-        let operator = self.simulated.operator();
         let mut share = 0.5 / (1.0 - 0.5f64.powi(self.calls.len() as i32));
         let mut total = Gradients::zero(vars.len());
         let mut back: Option<Array4<f32>> = None;
-        let mut to_momentum = Array2::zeros(operator.shape().image_dim());
+        let mut to_momentum = Array2::zeros(self.simulated.measurement().shape().image_dim());
         for call in self.calls.iter().rev() {
             let input = Var::from_tensor(&tensor(call.input.clone())?)?;
             let v = denoised(network, &input, call)?;
@@ -56,8 +55,9 @@ impl Unrolled {
 
     /// From the gradient by the input of a call to that by the result of the call before, both `[T, C, H, W]`.
     fn through_iteration(&self, to_input: Array4<f32>, to_momentum: &mut Array2<f32>) -> Result<Array4<f32>> {
-        let operator = self.simulated.operator();
-        let Some(cfa) = self.simulated.cfa() else {
+        let measurement = self.simulated.measurement();
+        let operator = measurement.operator();
+        let Some(cfa) = measurement.cfa() else {
             let to_x = to_input.index_axis(Axis(1), 0);
             return Ok(through_projection(operator, to_x, to_momentum).insert_axis(Axis(1)));
         };
@@ -71,7 +71,7 @@ impl Unrolled {
 }
 
 /// The result of a call, which sees its input as [`admm::Flips`] turns it.
-fn denoised(network: &dyn Network, input: &Tensor, call: &Call) -> Result<Tensor> {
+fn denoised(network: &dyn Network, input: &Tensor, call: &RecordedCall) -> Result<Tensor> {
     let axes: Vec<usize> = flipped_axes(call.iteration).map(|axis| axis.index()).collect();
     Ok(network.forward(&input.flip(&axes)?, &[call.sigma])?.flip(&axes)?)
 }
@@ -83,10 +83,14 @@ fn denoised(network: &dyn Network, input: &Tensor, call: &Call) -> Result<Tensor
 /// ```
 ///
 /// to `∂ℓ/∂v` and `∂ℓ/∂y1` before it: with `q = H ∂x / diag(H Hᵀ)`, `∂y1 ← ∂y1 + q` and `∂v = ∂x − Hᵀ (q + ∂y1)`.
-fn through_projection(operator: &MaskOperator, to_x: ArrayView3<'_, f32>, to_y1: &mut Array2<f32>) -> Array3<f32> {
+fn through_projection(
+    operator: &dyn SensingOperator,
+    to_x: ArrayView3<'_, f32>,
+    to_y1: &mut Array2<f32>,
+) -> Array3<f32> {
     let mut q = operator.forward(to_x);
     // Where no mask is open H is zero, and so is what is divided.
-    q.zip_mut_with(&operator.gram_diag(), |q, &d| *q = if d > 0.0 { *q / d } else { 0.0 });
+    q.zip_mut_with(&operator.gram(), |q, &d| *q = if d > 0.0 { *q / d } else { 0.0 });
     *to_y1 += &q;
     &to_x - &operator.adjoint((q + &*to_y1).view())
 }
