@@ -10,25 +10,17 @@ pub enum Error {
     /// The network refused to denoise.
     #[error("the network could not denoise")]
     Denoiser(#[source] admm::BoxError),
-    /// Measurement and masks differ in size, or a video is not theirs.
-    #[error("the {what} is {found:?}, the masks ask for {expected:?}")]
-    Size {
-        /// Which array.
-        what: &'static str,
-        /// The size it must have.
-        expected: Vec<usize>,
-        /// The size it has.
-        found: Vec<usize>,
-    },
-    /// The measurement holds a NaN or an infinity.
-    #[error("the measurement is {value} at row {row}, column {column}: every value must be finite")]
-    NotFinite {
-        /// The value.
-        value: f32,
-        /// Its row.
-        row: usize,
-        /// Its column.
-        column: usize,
+    /// A video does not belong to the measurement.
+    #[error(transparent)]
+    Measurement(#[from] sci_forward::MeasurementError),
+    /// An update is due where the measurement is not in sight.
+    #[error(
+        "an update is due in iteration {iteration}, but the denoiser is not told the measurement: an adaptive denoiser must be \
+         shown the whole video as the sensor saw it, not mirrored or in parts"
+    )]
+    NoMeasurement {
+        /// The iteration, counted from 0.
+        iteration: usize,
     },
     /// A gray network for a color sensor, or the other way round.
     #[error("{network} has {found} channel(s); a {sensor} sensor needs {expected}")]

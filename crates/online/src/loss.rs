@@ -9,114 +9,14 @@
 //! a stage is what the stage before propagates. The memory is that of one triplet through one block, half a window of
 //! five frames, besides one video for each stage. Frames of FFDNet, which reaches few rows, are taken a strip at a time.
 
-use crate::{Error, Result};
+use crate::Result;
 use candle_core::{DType, Tensor, Var};
-use ndarray::{Array2, Array4, ArrayView2, ArrayView4, Axis, Zip};
+use ndarray::{Array2, ArrayView2, ArrayView4, Axis, Zip};
 use nets::{Network, Window};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use sci_forward::bayer::{CfaPattern, mosaic_adjoint_into, mosaic_into};
-use sci_forward::{SensingOperator, VideoShape};
+use sci_forward::Measurement;
 use std::ops::Range;
-use std::sync::Arc;
-
-/// A measurement and what made it: `y = H T v`, `T` the mosaic of a color sensor or the identity of a gray one.
-#[derive(Clone)]
-pub struct Snapshot {
-    operator: Arc<dyn SensingOperator>,
-    y: Array2<f32>,
-    cfa: Option<CfaPattern>,
-}
-
-impl std::fmt::Debug for Snapshot {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Snapshot")
-            .field("shape", &self.operator.shape())
-            .field("cfa", &self.cfa)
-            .finish_non_exhaustive()
-    }
-}
-
-impl Snapshot {
-    /// Takes `y` `[H, W]`, on the scale of `Σ_t C_t`; `cfa` is the pattern of a color sensor.
-    ///
-    /// # Errors
-    /// [`Error::Size`], [`Error::NotFinite`].
-    pub fn new(operator: Arc<dyn SensingOperator>, y: ArrayView2<'_, f32>, cfa: Option<CfaPattern>) -> Result<Self> {
-        let expected = operator.shape().image_dim();
-        if y.dim() != expected {
-            let list = |(h, w)| vec![h, w];
-            return Err(Error::Size { what: "measurement", expected: list(expected), found: list(y.dim()) });
-        }
-        if let Some(((row, column), &value)) = y.indexed_iter().find(|(_, v)| !v.is_finite()) {
-            return Err(Error::NotFinite { value, row, column });
-        }
-        Ok(Self { operator, y: y.to_owned(), cfa })
-    }
-
-    /// H.
-    pub fn operator(&self) -> &Arc<dyn SensingOperator> {
-        &self.operator
-    }
-
-    /// The measurement `[H, W]`.
-    pub fn y(&self) -> ArrayView2<'_, f32> {
-        self.y.view()
-    }
-
-    /// The pattern of a color sensor.
-    pub fn cfa(&self) -> Option<CfaPattern> {
-        self.cfa
-    }
-
-    /// Frames, rows and columns.
-    pub fn shape(&self) -> VideoShape {
-        self.operator.shape()
-    }
-
-    /// Channels of a frame of v: 3 of a color sensor, else 1.
-    pub fn channels(&self) -> usize {
-        if self.cfa.is_some() { 3 } else { 1 }
-    }
-
-    fn check(&self, what: &'static str, v: ArrayView4<'_, f32>) -> Result<()> {
-        let (t, h, w) = self.shape().dim();
-        let expected = vec![t, self.channels(), h, w];
-        let found = v.shape().to_vec();
-        if found == expected { Ok(()) } else { Err(Error::Size { what, expected, found }) }
-    }
-
-    /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`.
-    ///
-    /// # Errors
-    /// [`Error::Size`].
-    pub fn residual(&self, v: ArrayView4<'_, f32>) -> Result<Array2<f32>> {
-        self.check("video", v)?;
-        let mut r = match self.cfa {
-            None => self.operator.forward(v.index_axis_move(Axis(1), 0)),
-            Some(cfa) => {
-                let mut mosaic = ndarray::Array3::zeros(self.shape().dim());
-                mosaic_into(cfa, v, mosaic.view_mut());
-                self.operator.forward(mosaic.view())
-            }
-        };
-        r -= &self.y;
-        Ok(r)
-    }
-
-    /// `Tᵀ Hᵀ g` `[T, C, H, W]`: in frame t `C_t ⊙ g`, in the channel that the pixel sees.
-    ///
-    /// # Panics
-    /// If `g` has not the size of the measurement.
-    pub fn pull_back(&self, g: ArrayView2<'_, f32>) -> Array4<f32> {
-        let mosaic = self.operator.adjoint(g);
-        let Some(cfa) = self.cfa else { return mosaic.insert_axis(Axis(1)) };
-        let (t, h, w) = mosaic.dim();
-        let mut rgb = Array4::zeros((t, 3, h, w));
-        mosaic_adjoint_into(cfa, mosaic.view(), rgb.view_mut());
-        rgb
-    }
-}
 
 /// What a pixel of a measurement is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -125,17 +25,16 @@ enum Role {
     Seen,
     /// It judges what the loss did.
     HeldOut,
-    /// Neither.
-    Neighbour,
+    /// It measures nothing: no mask opens it, or it is held out of the solve.
+    Closed,
 }
 
 /// Which pixels of a measurement the loss sees, and which are held out to judge what it did.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Pixels {
+pub struct PixelSplit {
     roles: Array2<Role>,
     seen: usize,
-    held: usize,
-    blind: bool,
+    held_out: usize,
 }
 
 /// The loss on the pixels of both kinds.
@@ -154,63 +53,24 @@ impl SplitLoss {
     }
 }
 
-impl Pixels {
-    /// Every pixel of `[H, W]` is held out with probability `held_out`, the same for the same seed; the loss sees the
-    /// others, at least one.
-    pub fn split(size: (usize, usize), held_out: f64, seed: u64) -> Self {
-        Self::draw(size, held_out, None, seed)
-    }
-
-    /// Every pixel is held out with probability `held_out` and seen by the loss with probability `seen`, at least one;
-    /// [`Pixels::blinded`] takes both out of the input.
-    pub fn blind(size: (usize, usize), held_out: f64, seen: f64, seed: u64) -> Self {
-        Self::draw(size, held_out, Some(seen), seed)
-    }
-
-    fn draw((height, width): (usize, usize), held_out: f64, seen: Option<f64>, seed: u64) -> Self {
+impl PixelSplit {
+    /// Every open pixel is held out with probability `held_out`, the same for the same seed; the loss sees the other open
+    /// ones. The loss sees at least one, and of two or more at least one is held out unless `held_out` is 0.
+    pub fn draw(measurement: &Measurement, held_out: f64, seed: u64) -> Self {
+        let gram = measurement.operator().gram();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut roles = Array2::from_shape_simple_fn((height, width), || match rng.random::<f64>() {
-            u if u < held_out => Role::HeldOut,
-            u if seen.is_some_and(|seen| u >= held_out + seen) => Role::Neighbour,
-            _ => Role::Seen,
+        let drawn = Array2::from_shape_simple_fn(gram.dim(), || rng.random::<f64>());
+        let (lowest, highest) = Zip::from(&drawn).and(gram).fold((1f64, 0f64), |(low, high), &u, &gram| {
+            if gram > 0.0 { (low.min(u), high.max(u)) } else { (low, high) }
         });
-        let count = |roles: &Array2<Role>, role| roles.iter().filter(|&&r| r == role).count();
-        if count(&roles, Role::Seen) == 0
-            && let Some(first) = roles.first_mut()
-        {
-            *first = Role::Seen;
-        }
-        Self { seen: count(&roles, Role::Seen), held: count(&roles, Role::HeldOut), roles, blind: seen.is_some() }
-    }
-
-    /// The input `[T, C, H, W]` of a network without what it says about the pixels that the loss looks at or that are
-    /// held out: each is the mean of the others among its eight neighbours. Nothing unless made by [`Pixels::blind`].
-    ///
-    /// The input of a denoiser has been projected onto the measurement, so that it holds every pixel of it, those held
-    /// out too; a network that denoises less then has a smaller error everywhere. What it makes of a pixel that it does
-    /// not see is a fair judge (Batson, Royer, *Noise2Self*, 2019).
-    ///
-    /// # Panics
-    /// If the video has not the size of the measurement.
-    pub fn blinded(&self, video: ArrayView4<'_, f32>) -> Option<Array4<f32>> {
-        let (.., height, width) = video.dim();
-        assert_eq!((height, width), self.roles.dim(), "the video must have the measurement's size");
-        let mut blinded = self.blind.then(|| video.to_owned())?;
-        let hidden = self.roles.indexed_iter().filter(|(_, role)| **role != Role::Neighbour);
-        for ((i, j), _) in hidden {
-            let around = |at: usize, n: usize| at.saturating_sub(1)..(at + 2).min(n);
-            let pairs = around(i, height).flat_map(|i| around(j, width).map(move |j| (i, j)));
-            let others: Vec<_> = pairs.filter(|&at| self.roles[at] == Role::Neighbour).collect();
-            if others.is_empty() {
-                continue;
-            }
-            for (mut out, frame) in blinded.outer_iter_mut().zip(video.outer_iter()) {
-                for (mut out, plane) in out.outer_iter_mut().zip(frame.outer_iter()) {
-                    out[[i, j]] = others.iter().map(|&at| plane[at]).sum::<f32>() / others.len() as f32;
-                }
-            }
-        }
-        Some(blinded)
+        let below = if held_out > 0.0 { held_out.max(lowest.next_up()).min(highest) } else { 0.0 };
+        let roles = Zip::from(&drawn).and(gram).map_collect(|&u, &gram| match () {
+            () if gram <= 0.0 => Role::Closed,
+            () if u < below => Role::HeldOut,
+            () => Role::Seen,
+        });
+        let count = |role| roles.iter().filter(|&&r| r == role).count();
+        Self { seen: count(Role::Seen), held_out: count(Role::HeldOut), roles }
     }
 
     /// Of a residual `[H, W]`, summed in `f64` in row-major order.
@@ -218,16 +78,16 @@ impl Pixels {
     /// # Panics
     /// If the residual has another size.
     pub fn loss(&self, residual: ArrayView2<'_, f32>) -> SplitLoss {
-        let (mut seen, mut held) = (0f64, 0f64);
+        let (mut seen, mut held_out) = (0f64, 0f64);
         Zip::from(residual).and(&self.roles).for_each(|&r, role| {
             let square = f64::from(r) * f64::from(r);
             match role {
                 Role::Seen => seen += square,
-                Role::HeldOut => held += square,
-                Role::Neighbour => {}
+                Role::HeldOut => held_out += square,
+                Role::Closed => {}
             }
         });
-        let held_out = (self.held > 0).then(|| held / self.held as f64);
+        let held_out = (self.held_out > 0).then(|| held_out / self.held_out as f64);
         SplitLoss { loss: seen / self.seen as f64, held_out }
     }
 
@@ -249,7 +109,7 @@ impl Pixels {
 /// summed in their order. One whose upstream is zero costs nothing.
 ///
 /// # Errors
-/// [`Error::Net`] as [`Network::forward`].
+/// [`Error::Net`](crate::Error::Net) as [`Network::forward`].
 ///
 /// # Panics
 /// If `sums` and `vars` do not belong together, or the videos differ in shape.
@@ -279,53 +139,71 @@ pub fn accumulate_gradient(
     let (_, _, h, w) = input.dim();
     let mut upstream = tensor(upstream)?.pad_with_zeros(2, 0, height - h)?.pad_with_zeros(3, 0, width - w)?;
     for (stage, windows) in stages.iter().enumerate().rev() {
-        upstream = propagate(network, (stage, windows), vars, (&read[stage], sigma), &upstream, sums)?;
+        upstream = StagePass { network, vars, sigma, stage, windows, read: &read[stage] }.propagate(&upstream, sums)?;
         read.truncate(stage);
     }
     Ok(())
 }
 
-/// One stage of [`accumulate_gradient`]; returns the gradient by what the stage reads (nothing for the first).
-fn propagate(
-    network: &dyn Network,
-    (stage, windows): (usize, &[Window]),
-    vars: &[(String, Var)],
-    (read, sigma): (&Tensor, f32),
-    upstream: &Tensor,
-    sums: &mut [Vec<f32>],
-) -> Result<Tensor> {
-    let (_, _, height, _) = read.dims4()?;
-    let frame = read.elem_count() / read.dim(0)?;
-    let mut below = vec![0f32; if stage == 0 { 0 } else { read.elem_count() }];
-    let strips = strips(network.reach().filter(|_| stage == 0), height);
-    for (window, Strip { rows, around }) in windows.iter().flat_map(|w| strips.iter().map(move |s| (w, s))) {
-        let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
-        let upstream = upstream.narrow(2, rows.start, rows.len())?;
-        if values(&upstream)?.iter().all(|&v| v == 0.0) {
-            continue;
+/// The way back through one stage of a network.
+struct StagePass<'p> {
+    network: &'p dyn Network,
+    vars: &'p [(String, Var)],
+    sigma: f32,
+    stage: usize,
+    windows: &'p [Window],
+    /// What the stage reads: padded frames, or the results of the stage before.
+    read: &'p Tensor,
+}
+
+impl StagePass<'_> {
+    /// Adds to `sums` the gradient by each variable, window by window and strip by strip, and returns that by what the
+    /// stage reads (nothing for the first).
+    fn propagate(&self, upstream: &Tensor, sums: &mut [Vec<f32>]) -> Result<Tensor> {
+        let &Self { network, stage, windows, read, .. } = self;
+        let frame = read.elem_count() / read.dim(0)?;
+        let mut below = vec![0f32; if stage == 0 { 0 } else { read.elem_count() }];
+        let strips = strips(network.reach().filter(|_| stage == 0), read.dim(2)?);
+        for (window, strip) in windows.iter().flat_map(|w| strips.iter().map(move |s| (w, s))) {
+            let upstream = upstream.narrow(0, window.outputs.start, window.outputs.len())?;
+            let upstream = upstream.narrow(2, strip.rows.start, strip.rows.len())?;
+            if values(&upstream)?.iter().all(|&v| v == 0.0) {
+                continue;
+            }
+            if let Some(to_inputs) = self.strip(window, strip, &upstream, sums)? {
+                for (&t, grad) in window.inputs.iter().zip(to_inputs.chunks_exact(frame)) {
+                    add(&mut below[t * frame..][..frame], grad);
+                }
+            }
         }
-        let mut inputs = gather(read, window)?.narrow(2, around.start, around.len())?;
-        let leaf = (stage > 0).then(|| Var::from_tensor(&inputs)).transpose()?;
+        match stage {
+            0 => Ok(Tensor::zeros(0, DType::F32, read.device())?),
+            _ => Ok(Tensor::from_vec(below, read.shape(), read.device())?),
+        }
+    }
+
+    /// One strip of one window; returns the gradient by its inputs (nothing for the first stage).
+    fn strip(
+        &self,
+        window: &Window,
+        Strip { rows, around }: &Strip,
+        upstream: &Tensor,
+        sums: &mut [Vec<f32>],
+    ) -> Result<Option<Vec<f32>>> {
+        let mut inputs = gather(self.read, window)?.narrow(2, around.start, around.len())?;
+        let leaf = (self.stage > 0).then(|| Var::from_tensor(&inputs)).transpose()?;
         if let Some(leaf) = &leaf {
             inputs = leaf.as_tensor().clone();
         }
-        let result = network.forward_window(stage, &inputs, sigma)?;
+        let result = self.network.forward_window(self.stage, &inputs, self.sigma)?;
         let result = result.narrow(2, rows.start - around.start, rows.len())?;
         let grads = (result * upstream)?.sum_all()?.backward()?;
-        for ((_, var), sum) in vars.iter().zip(&mut *sums) {
+        for ((_, var), sum) in self.vars.iter().zip(sums) {
             if let Some(grad) = grads.get(var) {
                 add(sum, &values(grad)?);
             }
         }
-        if let Some(grad) = leaf.as_ref().and_then(|leaf| grads.get(leaf)) {
-            for (&t, grad) in window.inputs.iter().zip(values(grad)?.chunks_exact(frame)) {
-                add(&mut below[t * frame..][..frame], grad);
-            }
-        }
-    }
-    match stage {
-        0 => Ok(Tensor::zeros(0, DType::F32, read.device())?),
-        _ => Ok(Tensor::from_vec(below, read.shape(), read.device())?),
+        leaf.as_ref().and_then(|leaf| grads.get(leaf)).map(values).transpose()
     }
 }
 

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 /// Why an update was undone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum RollBack {
+pub enum RollBackReason {
     /// The loss, a gradient or the new output was not finite.
     NotFinite,
     /// The error at the pixels held out did not fall.
@@ -18,11 +18,11 @@ pub enum RollBack {
 /// What became of an update that was due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Outcome {
+pub enum UpdateOutcome {
     /// The new weights are in use.
     Kept,
     /// The weights are, byte for byte, those before.
-    RolledBack(RollBack),
+    RolledBack(RollBackReason),
     /// It did not fire, as too many in a row had been rolled back.
     Skipped,
 }
@@ -37,7 +37,7 @@ pub struct Update {
     /// The learning rate; lower than the schedule's after roll-backs.
     pub learning_rate: f64,
     /// What became of it.
-    pub outcome: Outcome,
+    pub outcome: UpdateOutcome,
     /// Mean of `r²` over the pixels that the loss sees, before; of an update that was skipped not computed.
     pub loss_before: Option<f64>,
     /// The same with the new weights; nothing when they were not finite.
@@ -49,6 +49,20 @@ pub struct Update {
 }
 
 impl Update {
+    /// Before anything is tried.
+    pub(crate) fn skipped(measurement: usize, iteration: usize, learning_rate: f64) -> Self {
+        Self {
+            measurement,
+            iteration,
+            learning_rate,
+            outcome: UpdateOutcome::Skipped,
+            loss_before: None,
+            loss_after: None,
+            held_out_before: None,
+            held_out_after: None,
+        }
+    }
+
     pub(crate) fn with(mut self, before: SplitLoss, after: Option<SplitLoss>) -> Self {
         let finite = |v: f64| v.is_finite().then_some(v);
         self.loss_before = finite(before.loss);
@@ -59,9 +73,9 @@ impl Update {
     }
 }
 
-/// How many of which kind.
+/// How many updates of which kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct Counts {
+pub struct UpdateCounts {
     /// Tried: kept or rolled back.
     pub fired: usize,
     /// With new weights in use.
@@ -72,15 +86,15 @@ pub struct Counts {
     pub skipped: usize,
 }
 
-impl Counts {
+impl UpdateCounts {
     /// Of a list of updates.
     pub fn of(updates: &[Update]) -> Self {
-        let count = |f: fn(&Outcome) -> bool| updates.iter().filter(|u| f(&u.outcome)).count();
-        let skipped = count(|o| matches!(o, Outcome::Skipped));
+        let count = |f: fn(&UpdateOutcome) -> bool| updates.iter().filter(|u| f(&u.outcome)).count();
+        let skipped = count(|o| matches!(o, UpdateOutcome::Skipped));
         Self {
             fired: updates.len() - skipped,
-            kept: count(|o| matches!(o, Outcome::Kept)),
-            rolled_back: count(|o| matches!(o, Outcome::RolledBack(_))),
+            kept: count(|o| matches!(o, UpdateOutcome::Kept)),
+            rolled_back: count(|o| matches!(o, UpdateOutcome::RolledBack(_))),
             skipped,
         }
     }

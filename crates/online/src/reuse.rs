@@ -1,7 +1,7 @@
 //! What the next measurement may take over from the last, decided by the measurement alone.
 
-use crate::Snapshot;
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, Zip, s};
+use ndarray::{Array2, Array3, ArrayView3, Axis, Zip, s};
+use sci_forward::Measurement;
 use serde::{Deserialize, Serialize};
 
 /// What is left of one measurement when the next begins.
@@ -70,49 +70,54 @@ impl Default for Similarity {
 ///
 /// # Panics
 /// If the previous result has not the size of the new one.
-pub fn continuation(previous: ArrayView3<'_, f32>, snapshot: &Snapshot) -> (Array3<f32>, Relation) {
-    let (y, operator) = (snapshot.y(), snapshot.operator());
-    let norm = norm(y).max(f64::MIN_POSITIVE);
+pub fn continuation(previous: ArrayView3<'_, f32>, measurement: &Measurement) -> (Array3<f32>, Relation) {
+    let operator = measurement.operator();
     let last = previous.index_axis(Axis(0), previous.len_of(Axis(0)) - 1);
     let still_last = last.broadcast(previous.dim()).expect("a frame broadcasts over frames");
     let candidates = [previous, still_last, previous.slice(s![..;-1, .., ..])];
-    let residual = |video: &ArrayView3<'_, f32>| distance(operator.forward(*video).view(), y) / norm;
     let (best, previous) = candidates
         .iter()
-        .map(|video| (video, residual(video)))
+        .map(|video| (video, relative_residual(measurement, &operator.forward(*video))))
         .min_by(|a, b| a.1.total_cmp(&b.1))
         .expect("there are three candidates");
-    let open = operator.forward(Array3::ones(snapshot.shape().dim()).view());
-    let still = distance(still_image(snapshot, &open).view(), y) / norm;
-    let dot = |a: ArrayView2<'_, f32>| Zip::from(a).and(&open).fold(0.0, |sum, &a, &b| sum + f64::from(a * b));
-    let constant = (dot(y) / dot(open.view()).max(f64::MIN_POSITIVE)) as f32;
-    let flat = distance((&open * constant).view(), y) / norm;
+    let transmitted = operator.forward(Array3::ones(measurement.shape().dim()).view());
+    let still = relative_residual(measurement, &still_image(measurement, &transmitted));
+    let flat = relative_residual(measurement, &constant_image(measurement, &transmitted));
     (best.as_standard_layout().into_owned(), Relation { previous, still, flat })
 }
 
-/// `H` of the smooth still image, `open = a`: `s(p) = Σ_q a(q) y(q) / Σ_q a(q)²` over the 3×3 neighbours q of p (of the same color),
-/// `a = Σ_t C_t`, which is the constant that fits y there best in the sense of least squares.
-fn still_image(snapshot: &Snapshot, open: &Array2<f32>) -> Array2<f32> {
-    let y = snapshot.y();
-    let step = if snapshot.cfa().is_some() { 2 } else { 1 };
+/// `‖y − H x‖ / ‖y‖` over the open pixels.
+fn relative_residual(measurement: &Measurement, hx: &Array2<f32>) -> f64 {
+    let open = Zip::from(hx).and(measurement.y()).and(measurement.operator().gram());
+    let squares = open.fold(0.0, |sum, &hx, &y, &gram| if gram > 0.0 { sum + f64::from(hx - y).powi(2) } else { sum });
+    squares.sqrt() / measurement.scale()
+}
+
+/// `H` of the smooth still image, `transmitted = a`: `s(p) = Σ_q a(q) y(q) / Σ_q a(q)²` over the 3×3 neighbours q of p (of the same
+/// color), `a = Σ_t C_t`, which is the constant that fits y there best in the sense of least squares.
+fn still_image(measurement: &Measurement, transmitted: &Array2<f32>) -> Array2<f32> {
+    let y = measurement.y();
+    let step = if measurement.cfa().is_some() { 2 } else { 1 };
     let (height, width) = y.dim();
     Array2::from_shape_fn(y.dim(), |(i, j)| {
         let (mut above, mut below) = (0f32, 0f32);
         for (di, dj) in (0..9).map(|k| (k / 3, k % 3)) {
             let inside = |at: usize, d: usize, n: usize| (at + d * step).checked_sub(step).filter(|&at| at < n);
             if let (Some(i), Some(j)) = (inside(i, di, height), inside(j, dj, width)) {
-                above += open[[i, j]] * y[[i, j]];
-                below += open[[i, j]] * open[[i, j]];
+                above += transmitted[[i, j]] * y[[i, j]];
+                below += transmitted[[i, j]] * transmitted[[i, j]];
             }
         }
-        if below > 0.0 { open[[i, j]] * above / below } else { 0.0 }
+        if below > 0.0 { transmitted[[i, j]] * above / below } else { 0.0 }
     })
 }
 
-fn norm(y: ArrayView2<'_, f32>) -> f64 {
-    y.fold(0.0, |sum, &v| sum + f64::from(v).powi(2)).sqrt()
-}
-
-fn distance(a: ArrayView2<'_, f32>, b: ArrayView2<'_, f32>) -> f64 {
-    Zip::from(a).and(b).fold(0.0, |sum, &a, &b| sum + f64::from(a - b).powi(2)).sqrt()
+/// `H` of the constant that fits y best in the sense of least squares.
+fn constant_image(measurement: &Measurement, transmitted: &Array2<f32>) -> Array2<f32> {
+    let (mut above, mut below) = (0f64, 0f64);
+    Zip::from(transmitted).and(measurement.y()).for_each(|&a, &y| {
+        above += f64::from(a * y);
+        below += f64::from(a * a);
+    });
+    transmitted * (above / below.max(f64::MIN_POSITIVE)) as f32
 }

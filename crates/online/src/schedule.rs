@@ -7,14 +7,14 @@ use crate::{Error, Result};
 /// In iteration `k` (from 0) of measurement `m` (from 0) an update fires when `k > first` and `k mod interval_m = 0`,
 /// unless `max_updates` have fired in this measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Schedule {
+pub struct UpdateSchedule {
     /// No update up to this iteration: early iterations show only the rough features. 1 in the paper's code.
     pub first: usize,
     /// K₀, at least 1.
     pub interval: usize,
     /// At most so many in a measurement.
     pub max_updates: Option<usize>,
-    /// Steps of Adam in an update, at least 1.
+    /// Steps of Adam in an update, at least 1. Each update begins without moments, as in the paper's code.
     pub steps: usize,
     /// The gradient is that of every so many frames only, in the next update (or step) of the others; 1 for all, as in the
     /// paper. At least 1; more than there are frames is one of them. The residual is always that of all frames.
@@ -26,11 +26,9 @@ pub struct Schedule {
     pub input_noise: f32,
     /// `interval_m = interval · growthᵐ`, rounded: later measurements of a sequence update less often. At least 1.
     pub growth: f64,
-    /// Whether an update goes on with the moments of Adam that the one before left; the paper's begins anew.
-    pub keep_optimizer: bool,
 }
 
-impl Schedule {
+impl UpdateSchedule {
     /// The paper's code with FFDNet on *walk*-like color scenes: lr 2e-6, 2 steps, every 15 iterations.
     pub const PAPER_FFDNET: Self = Self {
         first: 1,
@@ -41,7 +39,6 @@ impl Schedule {
         learning_rate: 2e-6,
         input_noise: 0.0,
         growth: 1.0,
-        keep_optimizer: false,
     };
     /// The paper's code with FastDVDnet: lr 2e-7, 2 steps, every 12 iterations, noise of 5/255 on the input.
     pub const PAPER_FASTDVDNET: Self =
@@ -57,8 +54,8 @@ impl Schedule {
     /// Whether an update fires in iteration `k` of measurement `m`, of which `fired` have been in it already.
     ///
     /// ```
-    /// use online::Schedule;
-    /// let schedule = Schedule { interval: 4, max_updates: Some(2), ..Schedule::PAPER_FFDNET };
+    /// use online::UpdateSchedule;
+    /// let schedule = UpdateSchedule { interval: 4, max_updates: Some(2), ..UpdateSchedule::PAPER_FFDNET };
     /// let mut fired = 0;
     /// let mut due = |k| { let due = schedule.due(k, 0, fired); fired += usize::from(due); due };
     /// assert_eq!((0..16).filter(|&k| due(k)).collect::<Vec<_>>(), [4, 8]);
@@ -90,7 +87,7 @@ impl Schedule {
 mod tests {
     use super::*;
 
-    fn fired(schedule: Schedule, iterations: usize, m: usize) -> Vec<usize> {
+    fn fired(schedule: UpdateSchedule, iterations: usize, m: usize) -> Vec<usize> {
         let mut fired = Vec::new();
         for k in 0..iterations {
             if schedule.due(k, m, fired.len()) {
@@ -117,16 +114,16 @@ mod tests {
             ("FFDNet + DDNet, Beauty", 16, 6, None, &[6, 12]),
         ];
         for (row, iterations, interval, max_updates, expected) in table {
-            let schedule = Schedule { interval, max_updates, ..Schedule::PAPER_FFDNET };
+            let schedule = UpdateSchedule { interval, max_updates, ..UpdateSchedule::PAPER_FFDNET };
             assert_eq!(fired(schedule, iterations, 0), expected, "{row}");
         }
     }
 
     #[test]
     fn nothing_fires_up_to_first_and_the_interval_grows() {
-        let schedule = Schedule { interval: 1, first: 3, ..Schedule::PAPER_FFDNET };
+        let schedule = UpdateSchedule { interval: 1, first: 3, ..UpdateSchedule::PAPER_FFDNET };
         assert_eq!(fired(schedule, 7, 0), [4, 5, 6]);
-        let schedule = Schedule { interval: 3, growth: 2.0, ..Schedule::PAPER_FFDNET };
+        let schedule = UpdateSchedule { interval: 3, growth: 2.0, ..UpdateSchedule::PAPER_FFDNET };
         assert_eq!((fired(schedule, 13, 0), fired(schedule, 13, 1)), (vec![3, 6, 9, 12], vec![6, 12]));
         assert_eq!(schedule.interval_of(5000), usize::MAX);
         assert!(fired(schedule, 100, 5000).is_empty());
@@ -134,15 +131,15 @@ mod tests {
 
     #[test]
     fn settings_out_of_range_are_named() {
-        let ok = Schedule::PAPER_FFDNET;
+        let ok = UpdateSchedule::PAPER_FFDNET;
         let bad = [
-            Schedule { interval: 0, ..ok },
-            Schedule { steps: 0, ..ok },
-            Schedule { stride: 0, ..ok },
-            Schedule { learning_rate: 0.0, ..ok },
-            Schedule { learning_rate: f64::NAN, ..ok },
-            Schedule { input_noise: -1.0, ..ok },
-            Schedule { growth: 0.5, ..ok },
+            UpdateSchedule { interval: 0, ..ok },
+            UpdateSchedule { steps: 0, ..ok },
+            UpdateSchedule { stride: 0, ..ok },
+            UpdateSchedule { learning_rate: 0.0, ..ok },
+            UpdateSchedule { learning_rate: f64::NAN, ..ok },
+            UpdateSchedule { input_noise: -1.0, ..ok },
+            UpdateSchedule { growth: 0.5, ..ok },
         ];
         let keys = bad.map(|s| match s.validate() {
             Err(Error::Setting { key, .. }) => key,

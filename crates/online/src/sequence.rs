@@ -1,10 +1,11 @@
 //! The measurements of a scene in order.
 
 use crate::reuse::continuation;
-use crate::{AdaptiveDenoiser, Error, Relation, Result, Reuse, Similarity, Snapshot, Update};
-use admm::{Denoiser, Plan, SolveError, Start};
+use crate::{AdaptiveDenoiser, Error, Relation, Result, Reuse, Similarity, Update};
+use admm::{Denoiser, Outcome, Plan, SolveError, Start};
 use ndarray::{Array3, ArrayView3};
 use nets::Network;
+use sci_forward::Measurement;
 
 /// How a sequence is solved.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,7 +30,7 @@ pub struct Task {
     /// Its number, from 0.
     pub index: usize,
     /// The measurement.
-    pub snapshot: Snapshot,
+    pub measurement: Measurement,
     /// How it relates to the previous result, if there is one and it may be used.
     pub relation: Option<Relation>,
     /// Whether the scene was cut before it.
@@ -67,12 +68,12 @@ impl Task {
     /// Turns a denoiser to this measurement, with the weights that it is to begin with.
     ///
     /// # Errors
-    /// As [`AdaptiveDenoiser::bind`].
+    /// As [`AdaptiveDenoiser::begin_measurement`].
     pub fn prepare<N: Network + Denoiser>(&self, denoiser: &mut AdaptiveDenoiser<N>) -> Result<()> {
         if self.fresh {
             denoiser.reset()?;
         }
-        denoiser.bind(self.snapshot.clone())
+        denoiser.begin_measurement(&self.measurement)
     }
 }
 
@@ -103,22 +104,23 @@ impl Sequence {
     }
 
     /// What is to be done with the next measurement; [`Task::prepare`] readies each denoiser for it.
-    pub fn begin(&mut self, snapshot: Snapshot) -> Task {
+    pub fn begin(&mut self, measurement: Measurement) -> Task {
         let (index, similarity) = (self.index, self.config.similarity);
         self.index += 1;
-        let usable = |video: &Array3<f32>| video.dim() == snapshot.shape().dim() && video.iter().all(|v| v.is_finite());
+        let usable =
+            |video: &Array3<f32>| video.dim() == measurement.shape().dim() && video.iter().all(|v| v.is_finite());
         let previous = self.previous.take().filter(|_| self.config.reuse == Reuse::CarryOver).filter(usable);
-        let known = previous.map(|video| continuation(video.view(), &snapshot));
+        let known = previous.map(|video| continuation(video.view(), &measurement));
         let relation = known.as_ref().map(|(_, relation)| *relation);
         let cut = relation.is_some_and(|relation| relation.of_scene() > similarity.cut);
         let within = |limit: f64| !cut && relation.is_some_and(|relation| relation.of_start() <= limit);
         let fresh = cut || self.config.reuse == Reuse::Reset;
         let effort = if within(similarity.unchanged) { self.config.effort } else { 1.0 };
         let warm = known.filter(|_| within(similarity.warm)).map(|(video, _)| video);
-        Task { index, snapshot, relation, cut, effort, fresh, warm }
+        Task { index, measurement, relation, cut, effort, fresh, warm }
     }
 
-    /// Hands in the result `[T, H, W]` of the measurement that was begun last.
+    /// Hands in the result at the sensor, `[T, H, W]`, of the measurement that was begun last.
     pub fn finish(&mut self, estimate: ArrayView3<'_, f32>) {
         self.previous = Some(estimate.to_owned());
     }
@@ -126,9 +128,9 @@ impl Sequence {
 
 /// A measurement of a sequence, solved.
 #[derive(Debug)]
-pub struct Solved<S> {
+pub struct Solved {
     /// The result.
-    pub outcome: admm::Outcome<S>,
+    pub outcome: Outcome,
     /// How the measurement related to the result before.
     pub relation: Option<Relation>,
     /// Whether it was solved from the result before.
@@ -139,26 +141,26 @@ pub struct Solved<S> {
     pub updates: Vec<Update>,
 }
 
-/// Solves the measurements of a scene in order. `solve` runs a solver with the denoiser on [`Task::snapshot`], from
+/// Solves the measurements of a scene in order. `solve` runs a solver with the denoiser on [`Task::measurement`], from
 /// [`Task::start`], by [`Task::plan`]; under [`Reuse::Reset`] each result is that of the measurement alone.
 ///
 /// # Errors
 /// [`Error::Solve`] for what `solve` reports, [`Error::Channels`].
-pub fn run_sequence<N: Network + Denoiser, S>(
+pub fn run_sequence<N: Network + Denoiser>(
     denoiser: &mut AdaptiveDenoiser<N>,
-    snapshots: impl IntoIterator<Item = Snapshot>,
+    measurements: impl IntoIterator<Item = Measurement>,
     config: SequenceConfig,
-    mut solve: impl FnMut(&mut AdaptiveDenoiser<N>, &Task) -> std::result::Result<admm::Outcome<S>, SolveError>,
-) -> Result<Vec<Solved<S>>> {
+    mut solve: impl FnMut(&mut AdaptiveDenoiser<N>, &Task) -> std::result::Result<Outcome, SolveError>,
+) -> Result<Vec<Solved>> {
     let mut sequence = Sequence::new(config)?;
     let mut solved = Vec::new();
-    for snapshot in snapshots {
-        let task = sequence.begin(snapshot);
+    for measurement in measurements {
+        let task = sequence.begin(measurement);
         task.prepare(denoiser)?;
         let before = denoiser.updates().len();
         let outcome =
             solve(denoiser, &task).map_err(|source| Error::Solve { index: task.index, source: Box::new(source) })?;
-        sequence.finish(outcome.estimate.view());
+        sequence.finish(outcome.estimate.sensor.view());
         let updates = denoiser.updates()[before..].to_vec();
         solved.push(Solved { outcome, relation: task.relation, warm: task.is_warm(), cut: task.cut, updates });
     }

@@ -1,23 +1,23 @@
 //! The gradient of the loss: against autodiff of the whole video at once, PyTorch, and finite differences.
 
-use admm::{DenoiseCx, Denoiser};
+use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor, Var};
-use ndarray::{Array0, Array1, Array2, Array3, Array4, ArrayView4, Axis};
+use ndarray::{Array0, Array1, Array2, Array3, Array4, ArrayView4};
 use ndarray_npy::NpzReader;
 use nets::kernels::Isa;
 use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, Parameters};
-use online::{Pixels, Snapshot, accumulate_gradient};
+use online::{PixelSplit, accumulate_gradient};
 use sci_forward::testing::{gaussian, shared_file, uniform};
-use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoShape};
+use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
 use std::fs::File;
 use std::sync::Arc;
 
 const SIGMA: f32 = 0.1;
 
-fn snapshot(shape: VideoShape, cfa: Option<CfaPattern>) -> Snapshot {
+fn simulated(shape: VideoShape, cfa: Option<CfaPattern>) -> Measurement {
     let operator = Arc::new(MaskOperator::new(MaskStack::new(uniform(shape.dim(), 1)).unwrap()));
     let y = operator.forward(uniform(shape.dim(), 2).view());
-    Snapshot::new(operator, y.view(), cfa).unwrap()
+    Measurement::new(operator, y).unwrap().with_cfa(cfa)
 }
 
 fn tensor(video: ArrayView4<'_, f32>) -> Tensor {
@@ -27,35 +27,35 @@ fn tensor(video: ArrayView4<'_, f32>) -> Tensor {
 /// `∂ℓ/∂v` with the residual of the network's own inference.
 fn upstream<N: Network + Denoiser>(
     net: &mut N,
-    snapshot: &Snapshot,
-    pixels: &Pixels,
+    measurement: &Measurement,
+    pixels: &PixelSplit,
     x: ArrayView4<'_, f32>,
 ) -> Array4<f32> {
     let mut v = Array4::zeros(x.dim());
-    net.denoise(&DenoiseCx::new(SIGMA), x, v.view_mut()).unwrap();
-    snapshot.pull_back(pixels.gradient(snapshot.residual(v.view()).unwrap().view()).view())
+    net.denoise(&Call::new(SIGMA), x, v.view_mut()).unwrap();
+    measurement.pull_back(pixels.gradient(measurement.residual(v.view()).unwrap().view()).view())
 }
 
 fn two_pass<N: Network + Denoiser>(
     net: &mut N,
-    snapshot: &Snapshot,
-    pixels: &Pixels,
+    measurement: &Measurement,
+    pixels: &PixelSplit,
     x: ArrayView4<'_, f32>,
     which: Parameters,
 ) -> (Vec<(String, Var)>, Vec<Vec<f32>>) {
     let vars = net.make_some_trainable(which).unwrap();
-    let upstream = upstream(net, snapshot, pixels, x);
+    let upstream = upstream(net, measurement, pixels, x);
     let mut sums: Vec<Vec<f32>> = vars.iter().map(|(_, v)| vec![0.0; v.elem_count()]).collect();
     accumulate_gradient(net, &vars, x, SIGMA, upstream.view(), &mut sums).unwrap();
     (vars, sums)
 }
 
 /// The loss as one graph over all frames.
-fn whole_loss(net: &dyn Network, snapshot: &Snapshot, x: ArrayView4<'_, f32>) -> Tensor {
+fn whole_loss(net: &dyn Network, measurement: &Measurement, x: ArrayView4<'_, f32>) -> Tensor {
     let (t, c, h, w) = x.dim();
     // C_t where the sensor sees the channel: the adjoint of an image of ones.
-    let seen = snapshot.pull_back(Array2::ones((h, w)).view());
-    let y = Tensor::from_vec(snapshot.y().iter().copied().collect::<Vec<_>>(), (h, w), &Device::Cpu).unwrap();
+    let seen = measurement.pull_back(Array2::ones((h, w)).view());
+    let y = Tensor::from_vec(measurement.y().iter().copied().collect::<Vec<_>>(), (h, w), &Device::Cpu).unwrap();
     let v = net.forward(&tensor(x), &[SIGMA]).unwrap();
     let summed = (v * tensor(seen.view())).unwrap().reshape((t * c, h, w)).unwrap().sum(0).unwrap();
     (summed - y).unwrap().sqr().unwrap().mean_all().unwrap()
@@ -64,10 +64,11 @@ fn whole_loss(net: &dyn Network, snapshot: &Snapshot, x: ArrayView4<'_, f32>) ->
 #[track_caller]
 fn assert_equals_whole_graph<N: Network + Denoiser>(mut net: N, shape: VideoShape, which: Parameters) {
     let cfa = (net.channels() == 3).then_some(CfaPattern::Grbg);
-    let (snapshot, pixels) = (snapshot(shape, cfa), Pixels::split(shape.image_dim(), 0.0, 0));
+    let measurement = simulated(shape, cfa);
+    let pixels = PixelSplit::draw(&measurement, 0.0, 0);
     let x = uniform((shape.frames, net.channels(), shape.height, shape.width), 3);
-    let (vars, sums) = two_pass(&mut net, &snapshot, &pixels, x.view(), which);
-    let whole = whole_loss(&net, &snapshot, x.view()).backward().unwrap();
+    let (vars, sums) = two_pass(&mut net, &measurement, &pixels, x.view(), which);
+    let whole = whole_loss(&net, &measurement, x.view()).backward().unwrap();
     assert!(!vars.is_empty());
     for ((name, var), sum) in vars.iter().zip(&sums) {
         let expected = whole.get(var).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
@@ -162,25 +163,28 @@ fn the_gradient_equals_pytorchs() {
     let sigma: Array0<f64> = golden.by_name("sigma.npy").unwrap();
     let loss: Array0<f64> = golden.by_name("loss.npy").unwrap();
     let operator = Arc::new(MaskOperator::new(MaskStack::new(masks).unwrap()));
-    let snapshot = Snapshot::new(operator, y.view(), None).unwrap();
-    let pixels = Pixels::split(y.dim(), 0.0, 0);
+    let measurement = Measurement::new(operator, y).unwrap();
+    let pixels = PixelSplit::draw(&measurement, 0.0, 0);
     let mut net = Ffdnet::load(&weights).unwrap();
     let vars = net.make_trainable().unwrap();
 
     let sigma = *sigma.first().unwrap() as f32;
     let mut v = Array4::zeros(x.dim());
-    net.denoise(&DenoiseCx::new(sigma), x.view(), v.view_mut()).unwrap();
-    let residual = snapshot.residual(v.view()).unwrap();
-    let (found, expected) = (pixels.loss(residual.view()).loss, *loss.first().unwrap());
+    net.denoise(&Call::new(sigma), x.view(), v.view_mut()).unwrap();
+    let residual = measurement.residual(v.view()).unwrap();
+    // The mean of the reference is over all pixels: those that no mask opens add nothing but their number.
+    let open = measurement.operator().gram().iter().filter(|gram| **gram > 0.0).count();
+    let share = open as f64 / measurement.y().len() as f64;
+    let (found, expected) = (share * pixels.loss(residual.view()).loss, *loss.first().unwrap());
     assert!((found / expected - 1.0).abs() < 1e-4, "loss {found} instead of {expected}");
 
-    let upstream = snapshot.pull_back(pixels.gradient(residual.view()).view());
+    let upstream = measurement.pull_back(pixels.gradient(residual.view()).view());
     let mut sums: Vec<Vec<f32>> = vars.iter().map(|(_, v)| vec![0.0; v.elem_count()]).collect();
     accumulate_gradient(&net, &vars, x.view(), sigma, upstream.view(), &mut sums).unwrap();
     let compare = |name: &str, expected: Vec<f32>| {
         let i = vars.iter().position(|(n, _)| n == name).unwrap();
         let scale = expected.iter().fold(0f32, |m, v| m.max(v.abs()));
-        let worst = expected.iter().zip(&sums[i]).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
+        let worst = expected.iter().zip(&sums[i]).fold(0f32, |m, (a, b)| m.max((a - share as f32 * b).abs()));
         assert_eq!(expected.len(), sums[i].len());
         assert!(worst <= 1e-4 * scale, "{name}: {worst:e} of {scale:e}");
     };
@@ -195,10 +199,11 @@ fn the_gradient_equals_pytorchs() {
 #[test]
 fn one_weight_moved_changes_the_loss_as_the_gradient_says() {
     let shape = VideoShape { frames: 3, height: 12, width: 12 };
-    let (snapshot, pixels) = (snapshot(shape, None), Pixels::split(shape.image_dim(), 0.2, 7));
+    let measurement = simulated(shape, None);
+    let pixels = PixelSplit::draw(&measurement, 0.2, 7);
     let x = uniform((3, 1, 12, 12), 3);
     let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 8).unwrap();
-    let (vars, sums) = two_pass(&mut net, &snapshot, &pixels, x.view(), Parameters::All);
+    let (vars, sums) = two_pass(&mut net, &measurement, &pixels, x.view(), Parameters::All);
     for (layer, index) in [(0, 17), (2, 100), (4, 5)] {
         let var = &vars[layer].1;
         let start = var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
@@ -208,8 +213,8 @@ fn one_weight_moved_changes_the_loss_as_the_gradient_says() {
             moved[index] += by;
             var.set(&Tensor::from_vec(moved, var.shape(), &Device::Cpu).unwrap()).unwrap();
             let mut v = Array4::zeros(x.dim());
-            net.denoise(&DenoiseCx::new(SIGMA), x.view(), v.view_mut()).unwrap();
-            pixels.loss(snapshot.residual(v.view()).unwrap().view()).loss
+            net.denoise(&Call::new(SIGMA), x.view(), v.view_mut()).unwrap();
+            pixels.loss(measurement.residual(v.view()).unwrap().view()).loss
         };
         let slope = (loss(step) - loss(-step)) / f64::from(2.0 * step);
         let found = f64::from(sums[layer][index]);
@@ -218,69 +223,89 @@ fn one_weight_moved_changes_the_loss_as_the_gradient_says() {
     }
 }
 
-#[test]
-fn pixels_held_out_have_no_gradient_and_a_loss_of_their_own() {
-    let residual = gaussian((20, 30), 9);
-    let pixels = Pixels::split((20, 30), 0.25, 10);
-    let gradient = pixels.gradient(residual.view());
-    let held = gradient.iter().filter(|g| **g == 0.0).count();
-    assert!((100..200).contains(&held), "{held} of 600 held out");
-    let (seen, out): (Vec<_>, Vec<_>) = residual.iter().zip(&gradient).partition(|(_, g)| **g != 0.0);
-    let mean = |of: &[(&f32, &f32)]| of.iter().map(|(r, _)| f64::from(**r).powi(2)).sum::<f64>() / of.len() as f64;
-    let loss = pixels.loss(residual.view());
-    assert!((loss.loss - mean(&seen)).abs() < 1e-9 && (loss.held_out.unwrap() - mean(&out)).abs() < 1e-9);
-    assert_eq!(Pixels::split((20, 30), 0.25, 10), pixels);
-    assert_ne!(Pixels::split((20, 30), 0.25, 11), pixels);
-    // A fraction of 1 would leave nothing to learn from.
-    assert!(Pixels::split((2, 2), 0.999_999_9, 0).loss(Array2::ones((2, 2)).view()).loss.is_finite());
-    assert_eq!(residual.len_of(Axis(0)), 20);
+/// A measurement of which the first row is not open.
+fn first_row_closed(height: usize, width: usize) -> Measurement {
+    let whole = simulated(VideoShape { frames: 3, height, width }, None);
+    whole.restricted(Array2::from_shape_fn((height, width), |(row, _)| row > 0).view()).unwrap()
 }
 
 #[test]
-fn a_blinded_input_says_nothing_of_the_pixels_that_are_looked_at() {
-    let size = (16, 18);
-    let pixels = Pixels::blind(size, 0.1, 0.2, 12);
-    let looked_at = |at| {
-        let mut residual = Array2::zeros(size);
-        residual[at] = 1.0;
-        let loss = pixels.loss(residual.view());
-        loss.loss > 0.0 || loss.held_out.unwrap() > 0.0
-    };
-    let video = uniform((2, 3, 16, 18), 13);
-    let blinded = pixels.blinded(video.view()).unwrap();
-    let mut hidden = 0;
-    for at in ndarray::indices(size) {
-        if looked_at(at) {
-            hidden += 1;
-            let mut other = video.clone();
-            other.slice_mut(ndarray::s![.., .., at.0, at.1]).fill(9.0);
-            assert_eq!(pixels.blinded(other.view()).unwrap(), blinded, "{at:?}");
-        } else {
-            let here = ndarray::s![.., .., at.0, at.1];
-            assert_eq!(blinded.slice(here), video.slice(here));
+fn pixels_held_out_have_no_gradient_and_a_loss_of_their_own() {
+    let measurement = first_row_closed(20, 30);
+    let residual = gaussian((20, 30), 9);
+    let pixels = PixelSplit::draw(&measurement, 0.25, 10);
+    let gradient = pixels.gradient(residual.view());
+    assert!(gradient.row(0).iter().all(|g| *g == 0.0), "closed pixels measure nothing");
+    let open = residual.iter().zip(&gradient).skip(30);
+    let (seen, held): (Vec<_>, Vec<_>) = open.partition(|(_, g)| **g != 0.0);
+    assert!((100..190).contains(&held.len()), "{} of 570 held out", held.len());
+    let mean = |of: &[(&f32, &f32)]| of.iter().map(|(r, _)| f64::from(**r).powi(2)).sum::<f64>() / of.len() as f64;
+    let loss = pixels.loss(residual.view());
+    assert!((loss.loss - mean(&seen)).abs() < 1e-9 && (loss.held_out.unwrap() - mean(&held)).abs() < 1e-9);
+    assert_eq!(PixelSplit::draw(&measurement, 0.25, 10), pixels);
+    assert_ne!(PixelSplit::draw(&measurement, 0.25, 11), pixels);
+}
+
+/// However few or many are to be held out, and whatever the draw: one pixel at least is seen, and one judges.
+#[test]
+fn both_kinds_have_a_pixel_where_there_are_two() {
+    let residual = Array2::ones((2, 2));
+    let two_open = first_row_closed(2, 2);
+    for held_out in [1e-9, 0.5, 0.999_999_9] {
+        for seed in 0..20 {
+            let loss = PixelSplit::draw(&two_open, held_out, seed).loss(residual.view());
+            assert_eq!((loss.loss, loss.held_out), (1.0, Some(1.0)), "{held_out}, {seed}");
         }
     }
-    assert!((50..130).contains(&hidden), "{hidden} of 288");
-    assert_eq!(Pixels::split(size, 0.1, 12).blinded(video.view()), None);
+    assert_eq!(PixelSplit::draw(&two_open, 0.0, 0).loss(residual.view()).held_out, None);
+    // The only pixel is to be learned from.
+    let loss = PixelSplit::draw(&first_row_closed(2, 1), 0.9, 0).loss(Array2::ones((2, 1)).view());
+    assert_eq!((loss.loss, loss.held_out), (1.0, None));
+}
+
+/// The sums are of frames, windows and strips in their order, whatever the number of threads.
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    let tall = VideoShape { frames: 3, height: 200, width: 12 };
+    let ffdnet = Ffdnet::random(FfdnetSpec { width: 16, depth: 4, ..FfdnetSpec::GRAY }, 0).unwrap();
+    let spec = FastdvdnetSpec { channels: 3, widths: [4, 8, 8], batch_norm: true };
+    let fastdvdnet = Fastdvdnet::random(spec, Ends::Circular, 0).unwrap();
+    same_on_any_number_of_threads(&ffdnet, tall, None);
+    same_on_any_number_of_threads(&fastdvdnet, SHAPE, Some(CfaPattern::Grbg));
+}
+
+fn same_on_any_number_of_threads<N: Network + Denoiser + Clone>(net: &N, shape: VideoShape, cfa: Option<CfaPattern>) {
+    let measurement = simulated(shape, cfa);
+    let x = uniform((shape.frames, net.channels(), shape.height, shape.width), 3);
+    let pixels = PixelSplit::draw(&measurement, 0.1, 0);
+    let gradient = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| two_pass(&mut net.clone(), &measurement, &pixels, x.view(), Parameters::All).1)
+    };
+    let one = gradient(1);
+    assert!(one.iter().flatten().any(|g| *g != 0.0));
+    for threads in [2, 5] {
+        assert!(gradient(threads) == one, "{}, {threads} threads", net.describe());
+    }
 }
 
 /// Frames that take turns: their gradients add up to that of all frames, and frames without one are left out.
 #[test]
 fn the_gradients_of_parts_of_the_frames_add_up() {
     let shape = VideoShape { frames: 5, height: 8, width: 10 };
-    let snapshot = snapshot(shape, None);
+    let measurement = simulated(shape, None);
     let x = uniform((5, 1, 8, 10), 3);
     let ffdnet = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0).unwrap();
     let spec = FastdvdnetSpec { channels: 1, widths: [4, 8, 8], batch_norm: false };
     let fastdvdnet = Fastdvdnet::random(spec, Ends::Circular, 0).unwrap();
-    parts_add_up(ffdnet, &snapshot, x.view());
-    parts_add_up(fastdvdnet, &snapshot, x.view());
+    parts_add_up(ffdnet, &measurement, x.view());
+    parts_add_up(fastdvdnet, &measurement, x.view());
 }
 
-fn parts_add_up<N: Network + Denoiser>(mut net: N, snapshot: &Snapshot, x: ArrayView4<'_, f32>) {
-    let pixels = Pixels::split(snapshot.shape().image_dim(), 0.0, 0);
-    let (vars, whole) = two_pass(&mut net, snapshot, &pixels, x, Parameters::All);
-    let upstream = upstream(&mut net, snapshot, &pixels, x);
+fn parts_add_up<N: Network + Denoiser>(mut net: N, measurement: &Measurement, x: ArrayView4<'_, f32>) {
+    let pixels = PixelSplit::draw(measurement, 0.0, 0);
+    let (vars, whole) = two_pass(&mut net, measurement, &pixels, x, Parameters::All);
+    let upstream = upstream(&mut net, measurement, &pixels, x);
     let mut sums: Vec<Vec<f32>> = whole.iter().map(|g| vec![0.0; g.len()]).collect();
     for turn in 0..2 {
         let mut part = upstream.clone();
