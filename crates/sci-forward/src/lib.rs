@@ -54,6 +54,12 @@ pub use operator::{Restricted, SensingOperator};
 pub type BoxError = Box<dyn std::error::Error + Send + Sync + 'static>;
 
 /// The size of a gray or mosaic video `[T, H, W]`: `frames` × `height` × `width` pixels.
+///
+/// ```
+/// let shape = sci_forward::VideoShape { frames: 8, height: 256, width: 320 };
+/// assert_eq!((shape.dim(), shape.image_dim()), ((8, 256, 320), (256, 320)));
+/// assert_eq!(shape.to_string(), "8 frames of 256×320");
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct VideoShape {
     /// T, the frames that one measurement sums (the compression ratio B).

@@ -2,7 +2,7 @@
 
 use crate::operator::CLOSED;
 use crate::{MaskSource, ShiftingMasks, VideoShape};
-use ndarray::{Array2, Array3, ArrayView3, Dimension, IntoDimension, s};
+use ndarray::{Array2, Array3, ArrayView3, Dimension, IntoDimension};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -161,11 +161,34 @@ impl MaskStack {
     }
 
     /// Whether every transmittance is 0 or 1.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// use sci_forward::MaskStack;
+    /// assert!(MaskStack::new(array![[[0.0, 1.0]]])?.is_binary());
+    /// assert!(!MaskStack::new(array![[[0.0, 0.5]]])?.is_binary());
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
     pub fn is_binary(&self) -> bool {
         self.masks.iter().all(|&v| v == 0.0 || v == 1.0)
     }
 
+    #[inline]
+    fn row(&self, frame: usize, row: usize) -> &[f32] {
+        let (frames, height, width) = self.masks.dim();
+        assert!(frame < frames && row < height, "frame {frame}, row {row} of masks of {}", self.shape());
+        let masks = self.masks.as_slice().expect("stored in row-major order");
+        &masks[(frame * height + row) * width..][..width]
+    }
+
     /// `Σ_t C_t` `[H, W]`: what a static white scene measures.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// let masks = sci_forward::MaskStack::new(array![[[0.0, 1.0]], [[0.5, 1.0]]])?;
+    /// assert_eq!(masks.sum(), array![[0.5, 2.0]]);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
     pub fn sum(&self) -> Array2<f32> {
         self.masks.sum_axis(ndarray::Axis(0))
     }
@@ -177,8 +200,11 @@ impl MaskSource for MaskStack {
     }
 
     fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]) {
-        let row = self.masks.slice(s![frame, row, ..]).to_slice().expect("stored in row-major order");
-        out.copy_from_slice(&row[start..start + out.len()]);
+        out.copy_from_slice(&self.row(frame, row)[start..start + out.len()]);
+    }
+
+    fn stored(&self, frame: usize, row: usize) -> Option<&[f32]> {
+        Some(self.row(frame, row))
     }
 }
 
@@ -230,6 +256,7 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::s;
 
     const SHAPE: VideoShape = VideoShape { frames: 4, height: 31, width: 17 };
 

@@ -47,8 +47,16 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f64 {
 
 /// The mean over frames of a metric of two videos `[T, H, W]`.
 ///
+/// ```
+/// use ndarray::array;
+/// use sci_forward::metrics::{mean_over_frames, psnr};
+/// let (reference, video) = (array![[[0.0f32]], [[0.0]]], array![[[0.1f32]], [[0.01]]]);
+/// // 20 dB and 40 dB: of the frames' PSNR the mean is taken, not of their errors.
+/// assert!((mean_over_frames(reference.view(), video.view(), psnr) - 30.0).abs() < 1e-5);
+/// ```
+///
 /// # Panics
-/// If the numbers of frames differ.
+/// If the sizes differ.
 pub fn mean_over_frames<M>(reference: ArrayView3<'_, f32>, video: ArrayView3<'_, f32>, metric: M) -> f64
 where
     M: Fn(ArrayView2<'_, f32>, ArrayView2<'_, f32>) -> f64 + Sync,
@@ -60,7 +68,20 @@ where
 }
 
 /// Structural similarity as scikit-image's default and the paper's code have it: 7×7 uniform window, sample
-/// covariance (N / (N − 1)), K1 = 0.01, K2 = 0.03, 3 border pixels left out. NaN for images under 7×7.
+/// covariance (N / (N − 1)), K1 = 0.01, K2 = 0.03, 3 border pixels left out. At most 1, for equal images; NaN for images under
+/// 7×7.
+///
+/// ```text
+/// mean of (2 μ_a μ_b + C1) (2 σ_ab + C2) / ((μ_a² + μ_b² + C1) (σ_a² + σ_b² + C2)),  C1 = K1², C2 = K2²
+/// ```
+///
+/// ```
+/// use sci_forward::{metrics::ssim, testing::uniform};
+/// let image = uniform((16, 16), 0);
+/// let darker = image.mapv(|v| 0.5 * v);
+/// assert_eq!(ssim(image.view(), image.view()), 1.0);
+/// assert!(ssim(image.view(), darker.view()) < 0.9);
+/// ```
 ///
 /// # Panics
 /// If the sizes differ.
@@ -72,10 +93,21 @@ pub fn ssim(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>) -> f64 {
 }
 
 /// Structural similarity with the original's Gaussian window (11×11, σ = 1.5), population covariance, valid region only.
-/// NaN for images under 11×11.
+/// NaN for images under 11×11. The formula is that of [`ssim`].
+///
+/// ```
+/// use sci_forward::{metrics::ssim_gaussian, testing::uniform};
+/// let image = uniform((16, 16), 0);
+/// let darker = image.mapv(|v| 0.5 * v);
+/// assert!((ssim_gaussian(image.view(), image.view()) - 1.0).abs() < 1e-12);
+/// assert!(ssim_gaussian(image.view(), darker.view()) < 0.9);
+/// ```
 ///
 /// # Panics
 /// If the sizes differ.
+///
+/// # References
+/// Wang et al., *Image quality assessment: from error visibility to structural similarity*, 2004.
 pub fn ssim_gaussian(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>) -> f64 {
     let mut taps: [f64; 11] = std::array::from_fn(|i| (-0.5 * ((i as f64 - 5.0) / 1.5).powi(2)).exp());
     let sum: f64 = taps.iter().sum();

@@ -10,18 +10,35 @@ use rand_distr::StandardNormal;
 use std::path::{Path, PathBuf};
 
 /// Independent values, uniform in `[0, 1)`.
+///
+/// ```
+/// let values = sci_forward::testing::uniform((100, 100), 0);
+/// assert!((values.mean().unwrap() - 0.5).abs() < 0.01);
+/// ```
 pub fn uniform<D: Dimension, S: ShapeBuilder<Dim = D>>(shape: S, seed: u64) -> Array<f32, D> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     Array::from_shape_simple_fn(shape, || rng.random())
 }
 
 /// Independent values of the standard normal distribution.
+///
+/// ```
+/// let values = sci_forward::testing::gaussian((100, 100), 0);
+/// assert!(values.mean().unwrap().abs() < 0.03 && (values.var(0.0) - 1.0).abs() < 0.05);
+/// ```
 pub fn gaussian<D: Dimension, S: ShapeBuilder<Dim = D>>(shape: S, seed: u64) -> Array<f32, D> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     Array::from_shape_simple_fn(shape, || rng.sample(StandardNormal))
 }
 
 /// A video `[T, H, W]` in `[0, 1]` that looks like one: a shaded background and a bright square that moves.
+///
+/// ```
+/// use sci_forward::{VideoShape, testing::moving_square};
+/// let video = moving_square(VideoShape { frames: 4, height: 24, width: 24 });
+/// assert_eq!((video[[0, 6, 6]], video[[3, 9, 9]]), (0.9, 0.9));
+/// assert!(video[[3, 6, 6]] < 0.9);
+/// ```
 pub fn moving_square(shape: VideoShape) -> Array3<f32> {
     let (_, height, width) = shape.dim();
     let side = (height.min(width) / 3).max(1);
@@ -36,6 +53,13 @@ pub fn moving_square(shape: VideoShape) -> Array3<f32> {
 }
 
 /// Binary, calibrated and partly closed masks of one shape: the families that every operator test goes through.
+///
+/// ```
+/// use sci_forward::{VideoShape, testing::mask_families};
+/// let families = mask_families(VideoShape { frames: 4, height: 5, width: 6 }, 0);
+/// assert!(families[0].is_binary() && !families[1].is_binary());
+/// assert!(families[2].sum().iter().any(|sum| *sum == 0.0));
+/// ```
 ///
 /// # Panics
 /// If the shape is empty.
@@ -53,6 +77,13 @@ pub fn mask_families(shape: VideoShape, seed: u64) -> Vec<MaskStack> {
 }
 
 /// `|⟨H x, y⟩ − ⟨x, Hᵀ y⟩| / max(‖H x‖ ‖y‖, ‖x‖ ‖Hᵀ y‖)` for random `x` and `y`, summed in `f64`: 0 for an exact adjoint.
+///
+/// ```
+/// use sci_forward::{MaskOperator, VideoShape, testing::{adjoint_gap, mask_families}};
+/// for masks in mask_families(VideoShape { frames: 4, height: 5, width: 6 }, 0) {
+///     assert!(adjoint_gap(&MaskOperator::new(masks), 1) < 1e-6);
+/// }
+/// ```
 pub fn adjoint_gap(operator: &dyn SensingOperator, seed: u64) -> f64 {
     let shape = operator.shape();
     let (x, y) = (gaussian(shape.dim(), seed), gaussian(shape.image_dim(), seed ^ 1));
@@ -63,7 +94,7 @@ pub fn adjoint_gap(operator: &dyn SensingOperator, seed: u64) -> f64 {
     (left - right).abs() / scale.max(f64::MIN_POSITIVE)
 }
 
-/// Holds a source of masks to its promises: values in 0 to 1e9, the same in pieces as in a whole row.
+/// Holds a source of masks to its promises: values in 0 to 1e9, the same in pieces as in a whole row, and as they are stored.
 ///
 /// # Panics
 /// If a promise is broken.
@@ -80,6 +111,9 @@ pub fn check_source(source: &dyn MaskSource) {
         source.fill(frame, row, 0, &mut whole);
         let outside = whole.iter().position(|v| !(0.0..=1e9).contains(v));
         assert_eq!(outside.map(|column| whole[column]), None, "frame {frame}, row {row}");
+        if let Some(stored) = source.stored(frame, row) {
+            assert_eq!(stored, whole, "frame {frame}, row {row} as it is stored");
+        }
         // Pieces of every length from 1 on.
         let mut start = 0;
         for length in 1.. {
@@ -96,6 +130,15 @@ pub fn check_source(source: &dyn MaskSource) {
 
 /// An operator that masks alone do not make, for tests of what works with any: frame t is moved by t columns, around the edge, then
 /// masked and summed, `y[i, j] = Σ_t C_t[i, j] x_t[i, (j + t) mod W]`, as a disperser moves the bands of a spectral camera.
+///
+/// ```
+/// use ndarray::array;
+/// use sci_forward::{MaskStack, SensingOperator, testing::Sheared};
+/// let h = Sheared::new(MaskStack::new(array![[[1.0, 1.0]], [[1.0, 0.0]]])?);
+/// assert_eq!(h.forward(array![[[0.1, 0.2]], [[0.3, 0.4]]].view()), array![[0.5, 0.2]]);
+/// assert!(h.masks().is_none());
+/// # Ok::<(), sci_forward::MaskError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct Sheared(MaskOperator);
 

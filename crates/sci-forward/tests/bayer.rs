@@ -93,6 +93,18 @@ fn the_thread_count_does_not_change_a_bit() {
 }
 
 #[test]
+fn views_that_are_not_contiguous_give_the_same_bits() {
+    let wide = uniform((2, 80, 44), 3);
+    let mosaic = wide.slice(s![.., ..;2, 1..;2]);
+    for (name, mut method) in demosaicers() {
+        let mut rgb = Array4::from_elem((2, 3, 80, 44), f32::NAN);
+        method.demosaic(CfaPattern::Grbg, mosaic, rgb.slice_mut(s![.., .., 1..;2, ..;2])).unwrap();
+        let packed = demosaic(&mut *method, CfaPattern::Grbg, &mosaic.to_owned());
+        assert_eq!(rgb.slice(s![.., .., 1..;2, ..;2]), packed, "{name}");
+    }
+}
+
+#[test]
 fn a_demosaicer_has_a_name_and_can_go_to_another_thread() {
     let names = demosaicers().map(|(_, method)| std::thread::spawn(move || method.name().to_owned()).join().unwrap());
     assert_eq!(names, ["bilinear", "malvar", "menon"]);

@@ -7,6 +7,20 @@ use ndarray::parallel::prelude::*;
 use ndarray::{ArrayView2, ArrayView3, ArrayViewMut3, ArrayViewMut4, Axis};
 
 /// Each missing color is the mean of its two or four nearest samples.
+///
+/// ```
+/// use ndarray::{Array4, array};
+/// use sci_forward::{CfaPattern, Demosaicer, bayer::Bilinear};
+///
+/// // A red pixel among green and blue ones.
+/// let mosaic = array![[[0.8, 0.2, 0.1, 0.3], [0.4, 0.5, 0.2, 0.1], [0.1, 0.2, 0.7, 0.2], [0.3, 0.3, 0.4, 0.1]]];
+/// let mut rgb = Array4::zeros((1, 3, 4, 4));
+/// Bilinear.demosaic(CfaPattern::Rggb, mosaic.view(), rgb.view_mut())?;
+/// assert_eq!(rgb[[0, 0, 2, 2]], 0.7);
+/// assert!((rgb[[0, 1, 2, 2]] - (0.2 + 0.2 + 0.2 + 0.4) / 4.0f32).abs() < 1e-6);
+/// assert!((rgb[[0, 2, 2, 2]] - (0.5 + 0.1 + 0.3 + 0.1) / 4.0f32).abs() < 1e-6);
+/// # Ok::<(), sci_forward::BoxError>(())
+/// ```
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Bilinear;
 

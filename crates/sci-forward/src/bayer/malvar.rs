@@ -22,6 +22,19 @@ const BAND: usize = 32;
 /// red at blue, blue at red           6 m + 2 d − 3/2 (h2 + v2)
 /// ```
 ///
+/// ```
+/// use ndarray::{Array3, Array4};
+/// use sci_forward::{CfaPattern, Demosaicer, bayer::Malvar};
+///
+/// // One bright red sample: green there rises by half of it.
+/// let mut mosaic = Array3::zeros((1, 8, 8));
+/// mosaic[[0, 4, 4]] = 1.0;
+/// let mut rgb = Array4::zeros((1, 3, 8, 8));
+/// Malvar.demosaic(CfaPattern::Rggb, mosaic.view(), rgb.view_mut())?;
+/// assert_eq!([0, 1, 2].map(|channel| rgb[[0, channel, 4, 4]]), [1.0, 0.5, 0.75]);
+/// # Ok::<(), sci_forward::BoxError>(())
+/// ```
+///
 /// # References
 /// Malvar, He, Cutler, *High-quality linear interpolation for demosaicing of Bayer-patterned color images*, 2004.
 #[derive(Debug, Clone, Copy, Default)]

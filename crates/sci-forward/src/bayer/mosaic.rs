@@ -62,6 +62,13 @@ fn check((frames, height, width): (usize, usize, usize), rgb: (usize, usize, usi
 
 /// The sub-lattice of sites `(row + 2i, column + 2j)` of a mosaic video `[T, H, W]`, as a view; `row` and `column` are 0 or 1.
 /// All its pixels have one color.
+///
+/// ```
+/// use ndarray::array;
+/// use sci_forward::bayer::sub_lattice;
+/// let mosaic = array![[[0.0, 0.1, 0.2], [1.0, 1.1, 1.2], [2.0, 2.1, 2.2]]];
+/// assert_eq!(sub_lattice(mosaic.view(), 0, 1), array![[[0.1], [2.1]]]);
+/// ```
 pub fn sub_lattice(mosaic: ArrayView3<'_, f32>, row: usize, column: usize) -> ArrayView3<'_, f32> {
     mosaic.slice_move(s![.., row..;2, column..;2])
 }

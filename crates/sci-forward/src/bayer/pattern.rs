@@ -30,6 +30,11 @@ impl CfaPattern {
     pub const ALL: [Self; 4] = [Self::Rggb, Self::Bggr, Self::Grbg, Self::Gbrg];
 
     /// Row and column, each 0 or 1, of the red site of the 2×2 block. Blue is at the opposite corner.
+    ///
+    /// ```
+    /// use sci_forward::CfaPattern;
+    /// assert_eq!(CfaPattern::Grbg.red_site(), (0, 1));
+    /// ```
     pub fn red_site(self) -> (usize, usize) {
         match self {
             Self::Rggb => (0, 0),

@@ -30,7 +30,7 @@ pub fn mirror(i: isize, n: usize) -> usize {
 /// Writes row `r` (which may lie outside the image) to `row`, with [`PAD`] mirrored columns on each side.
 fn padded_row(image: ArrayView2<'_, f32>, r: isize, row: &mut [f32]) {
     let (height, width) = image.dim();
-    row[PAD..][..width].iter_mut().zip(image.row(mirror(r, height))).for_each(|(to, v)| *to = *v);
+    ArrayViewMut1::from(&mut row[PAD..][..width]).assign(&image.row(mirror(r, height)));
     mirror_columns(row);
 }
 
@@ -62,8 +62,8 @@ fn merge<const FIRST: usize>(to: &mut [f32], from: &[f32]) {
             to[lane] = if lane % 2 == FIRST { from[lane] } else { to[lane] };
         }
     }
-    for (to, from) in to_rest.iter_mut().zip(from_rest).skip(FIRST).step_by(2) {
-        *to = *from;
+    for column in (FIRST..to_rest.len()).step_by(2) {
+        to_rest[column] = from_rest[column];
     }
 }
 

@@ -3,6 +3,7 @@
 use super::MaskSource;
 use crate::masks::validated;
 use crate::{MaskError, VideoShape};
+use multiversion::multiversion;
 
 /// The masks of another source, each frame's times a gain of its own: `C_t = g_t S_t`.
 ///
@@ -44,8 +45,27 @@ impl<S: MaskSource> MaskSource for Gained<S> {
     }
 
     fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]) {
-        self.source.fill(frame, row, start, out);
-        let gain = self.gain[frame];
-        out.iter_mut().for_each(|v| *v *= gain);
+        match self.source.stored(frame, row) {
+            Some(stored) => write_scaled(out, &stored[start..], self.gain[frame]),
+            None => {
+                self.source.fill(frame, row, start, out);
+                scale(out, self.gain[frame]);
+            }
+        }
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn write_scaled(to: &mut [f32], from: &[f32], gain: f32) {
+    let from = &from[..to.len()];
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = gain * from;
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn scale(values: &mut [f32], gain: f32) {
+    for value in values {
+        *value *= gain;
     }
 }

@@ -16,6 +16,7 @@ use crate::operator::CLOSED;
 use crate::{MaskStack, SensingOperator, VideoShape};
 use ndarray::parallel::prelude::*;
 use ndarray::{Array2, ArrayView2, ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
+use rows::Rows;
 
 /// Rows of one parallel task.
 const BAND: usize = 16;
@@ -23,7 +24,9 @@ const BAND: usize = 16;
 /// Masks `C_t` `[T, H, W]` that are written a piece of a row at a time: they need not be stored as they are used.
 ///
 /// [`MaskStack`] stores `f32`, [`BinaryMasks`] a bit a pixel, [`ShiftingMasks`] one pattern that moves, and [`Gained`] changes
-/// the frames of another source by a factor each. A source of one's own promises transmittances in 0 to 1e9, the same at every
+/// the frames of another source by a factor each. A spectral camera (CASSI) fits too: the bands are the frames, each as wide as the
+/// measurement, and band t's mask is the coded aperture moved by t columns and closed beside it; what is to be denoised is the
+/// video moved back. A source of one's own promises transmittances in 0 to 1e9, the same at every
 /// call; `testing::check_source` (feature `testing`) holds it to that.
 ///
 /// ```
@@ -55,6 +58,14 @@ pub trait MaskSource: Send + Sync {
     /// # Panics
     /// If a position is outside [`MaskSource::shape`].
     fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]);
+
+    /// The whole of a `row` of `frame`, if it is stored as [`MaskSource::fill`] would write it: it need not be copied then.
+    ///
+    /// # Panics
+    /// If a position is outside [`MaskSource::shape`].
+    fn stored(&self, _frame: usize, _row: usize) -> Option<&[f32]> {
+        None
+    }
 }
 
 impl<S: MaskSource + ?Sized> MaskSource for Box<S> {
@@ -64,6 +75,10 @@ impl<S: MaskSource + ?Sized> MaskSource for Box<S> {
 
     fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]) {
         (**self).fill(frame, row, start, out);
+    }
+
+    fn stored(&self, frame: usize, row: usize) -> Option<&[f32]> {
+        (**self).stored(frame, row)
     }
 }
 
@@ -91,12 +106,7 @@ pub struct MaskOperator<S = MaskStack> {
 impl<S: MaskSource> MaskOperator<S> {
     /// The operator of these masks.
     pub fn new(source: S) -> Self {
-        let mut gram = Array2::zeros(source.shape().image_dim());
-        gram.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(row, mut gram)| {
-            rows::gram(&source, row, gram.view_mut());
-            // What is too small to divide by measures nothing, see `SensingOperator::gram`.
-            gram.mapv_inplace(|v| if v > CLOSED { v } else { 0.0 });
-        });
+        let gram = gram_of(&source);
         Self { source, gram }
     }
 
@@ -112,6 +122,19 @@ impl<S: MaskSource> MaskOperator<S> {
     }
 }
 
+/// `Σ_t C_t²`, but 0 where that is too small to divide by, see [`SensingOperator::gram`].
+fn gram_of(source: &impl MaskSource) -> Array2<f32> {
+    let mut gram = Array2::zeros(source.shape().image_dim());
+    gram.axis_chunks_iter_mut(Axis(0), BAND).into_par_iter().enumerate().for_each(|(band, mut gram)| {
+        let mut rows = Rows::of(source);
+        for (row, gram) in gram.outer_iter_mut().enumerate() {
+            rows.gram(band * BAND + row, gram.into_slice().expect("a row of a new array"));
+        }
+        gram.mapv_inplace(|v| if v > CLOSED { v } else { 0.0 });
+    });
+    gram
+}
+
 impl<S: MaskSource> SensingOperator for MaskOperator<S> {
     fn shape(&self) -> VideoShape {
         self.source.shape()
@@ -121,8 +144,9 @@ impl<S: MaskSource> SensingOperator for MaskOperator<S> {
         self.check(x.dim(), y.dim());
         let bands = y.axis_chunks_iter_mut(Axis(0), BAND).into_par_iter().zip(x.axis_chunks_iter(Axis(1), BAND));
         bands.enumerate().for_each(|(band, (mut y, x))| {
+            let mut rows = Rows::of(&self.source);
             for (row, (y, x)) in y.outer_iter_mut().zip(x.axis_iter(Axis(1))).enumerate() {
-                rows::forward(&self.source, band * BAND + row, x, y);
+                rows.forward(band * BAND + row, x, y);
             }
         });
     }
@@ -131,8 +155,9 @@ impl<S: MaskSource> SensingOperator for MaskOperator<S> {
         self.check(x.dim(), y.dim());
         let bands = x.axis_chunks_iter_mut(Axis(1), BAND).into_par_iter().zip(y.axis_chunks_iter(Axis(0), BAND));
         bands.enumerate().for_each(|(band, (mut x, y))| {
+            let mut rows = Rows::of(&self.source);
             for (row, (x, y)) in x.axis_iter_mut(Axis(1)).zip(y.outer_iter()).enumerate() {
-                rows::adjoint(&self.source, band * BAND + row, y, x);
+                rows.adjoint(band * BAND + row, y, x);
             }
         });
     }

@@ -1,68 +1,70 @@
-//! The operator on one row, a chunk of columns at a time.
+//! The operator on one row.
 
 use super::MaskSource;
 use multiversion::multiversion;
-use ndarray::{ArrayView1, ArrayView2, ArrayViewMut1, ArrayViewMut2, s};
+use ndarray::{ArrayView1, ArrayView2, ArrayViewMut1, ArrayViewMut2};
 use std::borrow::Cow;
-use std::ops::Range;
 
-/// Columns that are worked on at a time: a chunk of masks and one of sums stay in the first-level cache.
-const CHUNK: usize = 1024;
-
-/// The chunks of a row.
-fn chunks(width: usize) -> impl Iterator<Item = Range<usize>> {
-    (0..width).step_by(CHUNK).map(move |start| start..(start + CHUNK).min(width))
+/// Masks, and room for a row of them.
+pub(super) struct Rows<'a, S> {
+    source: &'a S,
+    room: Vec<f32>,
 }
 
-/// `gram = Σ_t c_t²`.
-pub(super) fn gram(masks: &impl MaskSource, row: usize, mut gram: ArrayViewMut1<'_, f32>) {
-    let (mut c, mut sum) = ([0.0; CHUNK], [0.0; CHUNK]);
-    for columns in chunks(gram.len()) {
-        let (c, sum) = (&mut c[..columns.len()], &mut sum[..columns.len()]);
-        sum.fill(0.0);
-        for t in 0..masks.shape().frames {
-            masks.fill(t, row, columns.start, c);
-            add_product(sum, c, c);
-        }
-        gram.slice_mut(s![columns]).assign(&ArrayView1::from(&*sum));
+impl<'a, S: MaskSource> Rows<'a, S> {
+    pub(super) fn of(source: &'a S) -> Self {
+        Self { source, room: vec![0.0; source.shape().width] }
     }
-}
 
-/// `y = Σ_t c_t x_t`; `x` is `[T, W]`.
-pub(super) fn forward(masks: &impl MaskSource, row: usize, x: ArrayView2<'_, f32>, mut y: ArrayViewMut1<'_, f32>) {
-    let (mut c, mut sum) = ([0.0; CHUNK], [0.0; CHUNK]);
-    for columns in chunks(y.len()) {
-        let (c, sum) = (&mut c[..columns.len()], &mut sum[..columns.len()]);
-        sum.fill(0.0);
-        for (t, x) in x.outer_iter().enumerate() {
-            masks.fill(t, row, columns.start, c);
-            add_product(sum, c, &packed(x.slice_move(s![columns.clone()])));
+    /// `gram = Σ_t c_t²`.
+    pub(super) fn gram(&mut self, row: usize, gram: &mut [f32]) {
+        gram.fill(0.0);
+        for t in 0..self.source.shape().frames {
+            let c = masks(self.source, t, row, &mut self.room);
+            add_product(gram, c, c);
         }
-        y.slice_mut(s![columns]).assign(&ArrayView1::from(&*sum));
     }
-}
 
-/// `x_t = c_t y`; `x` is `[T, W]`.
-pub(super) fn adjoint(masks: &impl MaskSource, row: usize, y: ArrayView1<'_, f32>, mut x: ArrayViewMut2<'_, f32>) {
-    let y = packed(y);
-    let mut c = [0.0; CHUNK];
-    for columns in chunks(y.len()) {
-        let y = &y[columns.clone()];
-        for (t, mut x) in x.outer_iter_mut().enumerate() {
-            let mut x = x.slice_mut(s![columns.clone()]);
-            match x.as_slice_mut() {
-                Some(x) => {
-                    masks.fill(t, row, columns.start, x);
-                    multiply(x, y);
-                }
-                None => {
-                    let c = &mut c[..y.len()];
-                    masks.fill(t, row, columns.start, c);
-                    x.iter_mut().zip(&*c).zip(y).for_each(|((x, c), y)| *x = c * y);
-                }
+    /// `y = Σ_t c_t x_t`; `x` is `[T, W]`.
+    pub(super) fn forward(&mut self, row: usize, x: ArrayView2<'_, f32>, mut y: ArrayViewMut1<'_, f32>) {
+        match y.as_slice_mut() {
+            Some(y) => self.sum_of_products(row, x, y),
+            None => {
+                let mut sum = vec![0.0; y.len()];
+                self.sum_of_products(row, x, &mut sum);
+                y.assign(&ArrayView1::from(&sum));
             }
         }
     }
+
+    fn sum_of_products(&mut self, row: usize, x: ArrayView2<'_, f32>, y: &mut [f32]) {
+        y.fill(0.0);
+        for (t, x) in x.outer_iter().enumerate() {
+            let c = masks(self.source, t, row, &mut self.room);
+            add_product(y, c, &packed(x));
+        }
+    }
+
+    /// `x_t = c_t y`; `x` is `[T, W]`.
+    pub(super) fn adjoint(&mut self, row: usize, y: ArrayView1<'_, f32>, mut x: ArrayViewMut2<'_, f32>) {
+        let y = packed(y);
+        for (t, mut x) in x.outer_iter_mut().enumerate() {
+            let c = masks(self.source, t, row, &mut self.room);
+            match x.as_slice_mut() {
+                Some(x) => write_product(x, c, &y),
+                None => x.iter_mut().zip(c).zip(&*y).for_each(|((x, c), y)| *x = c * y),
+            }
+        }
+    }
+}
+
+/// A row of masks, where it is stored or made in `room`.
+fn masks<'a>(source: &'a impl MaskSource, frame: usize, row: usize, room: &'a mut [f32]) -> &'a [f32] {
+    if let Some(stored) = source.stored(frame, row) {
+        return stored;
+    }
+    source.fill(frame, row, 0, room);
+    room
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
@@ -73,9 +75,9 @@ fn add_product(sum: &mut [f32], a: &[f32], b: &[f32]) {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-pub(super) fn multiply(product: &mut [f32], by: &[f32]) {
-    for (product, by) in product.iter_mut().zip(by) {
-        *product *= by;
+fn write_product(to: &mut [f32], a: &[f32], b: &[f32]) {
+    for ((to, a), b) in to.iter_mut().zip(a).zip(b) {
+        *to = a * b;
     }
 }
 

@@ -106,29 +106,41 @@ impl Shift {
     }
 }
 
+impl ShiftingMasks {
+    /// The pattern from where a frame has `row`, `column` on, but for a fraction.
+    fn piece(&self, frame: usize, row: usize, column: usize) -> &[f32] {
+        let Shift { row: down, column: right, .. } = self.shifts[frame];
+        let width = self.pattern.shape().width;
+        let pattern = self.pattern.view().to_slice().expect("a stack is in row-major order");
+        &pattern[(row + down) * width..][..width][column + right..]
+    }
+}
+
 impl MaskSource for ShiftingMasks {
     fn shape(&self) -> VideoShape {
         self.shape
     }
 
     fn fill(&self, frame: usize, row: usize, start: usize, out: &mut [f32]) {
-        assert!(
-            row < self.shape.height && start + out.len() <= self.shape.width,
-            "outside the masks of {}",
-            self.shape
-        );
-        let Shift { row: down, column: right, fraction } = self.shifts[frame];
-        let width = self.pattern.shape().width;
-        let pattern = self.pattern.view().to_slice().expect("a stack is in row-major order");
+        let VideoShape { height, width, .. } = self.shape;
+        assert!(row < height && start + out.len() <= width, "outside the masks of {}", self.shape);
         // At a whole offset the next row or column may not exist, and is not needed.
+        let Shift { fraction, .. } = self.shifts[frame];
         let [below, beside] = fraction.map(|f| usize::from(f > 0.0));
-        let at = |dy, dx| &pattern[(row + down + dy) * width + start + right + dx..][..out.len()];
+        let at = |down, right| &self.piece(frame, row + down, start + right)[..out.len()];
+        let [a, b, c, d] = [at(0, 0), at(0, beside), at(below, 0), at(below, beside)];
         match (below, beside) {
-            (0, 0) => out.copy_from_slice(at(0, 0)),
-            (0, 1) => interpolate(out, [at(0, 0), at(0, 1)], fraction[1]),
-            (1, 0) => interpolate(out, [at(0, 0), at(1, 0)], fraction[0]),
-            _ => interpolate_both(out, [[at(0, 0), at(0, 1)], [at(1, 0), at(1, 1)]], fraction),
+            (0, 0) => out.copy_from_slice(a),
+            (0, _) => interpolate(out, [a, b], fraction[1]),
+            (_, 0) => interpolate(out, [a, c], fraction[0]),
+            _ => interpolate_both(out, [[a, b], [c, d]], fraction),
         }
+    }
+
+    fn stored(&self, frame: usize, row: usize) -> Option<&[f32]> {
+        assert!(row < self.shape.height, "outside the masks of {}", self.shape);
+        let whole = self.shifts[frame].fraction == [0.0; 2];
+        whole.then(|| &self.piece(frame, row, 0)[..self.shape.width])
     }
 }
 

@@ -7,7 +7,7 @@ use super::{CfaPattern, Color, Demosaicer, check_sizes};
 use crate::BoxError;
 use kernels::{Cross, change, decide, green, interpolate, refine, refine_at_green, select};
 use ndarray::parallel::prelude::*;
-use ndarray::{ArrayView1, ArrayView2, ArrayView3, ArrayViewMut3, ArrayViewMut4, Axis};
+use ndarray::{ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut3, ArrayViewMut4, Axis};
 
 /// Rows of one parallel task.
 const BAND: usize = 64;
@@ -225,7 +225,7 @@ impl<'a> Band<'a> {
 
     fn read(&mut self, row: isize) {
         let source = self.mosaic.row(row as usize);
-        self.samples.make(row, |to| to.iter_mut().zip(source).for_each(|(to, v)| *to = *v));
+        self.samples.make(row, |to| ArrayViewMut1::from(to).assign(&source));
     }
 
     fn interpolate_green(&mut self, row: isize) {
