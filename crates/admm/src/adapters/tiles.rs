@@ -147,6 +147,25 @@ impl<D: Denoiser> Tiles<D> {
         self.still.par_iter_mut().enumerate().map(need).collect()
     }
 
+    /// Keeps the input and output of these tiles.
+    fn remember(
+        &mut self,
+        stage: usize,
+        noisy: ArrayView4<'_, f32>,
+        out: ArrayView4<'_, f32>,
+        tiles: impl Iterator<Item = (Range<usize>, Range<usize>)>,
+    ) {
+        let known = self.memory.take().filter(|m| m.input.dim() == noisy.dim());
+        let mut memory = known.unwrap_or_else(|| Memory { stage, input: noisy.to_owned(), output: out.to_owned() });
+        memory.stage = stage;
+        for (rows, columns) in tiles {
+            let tile = s![.., .., rows, columns];
+            memory.input.slice_mut(tile).assign(&noisy.slice(tile));
+            memory.output.slice_mut(tile).assign(&out.slice(tile));
+        }
+        self.memory = Some(memory);
+    }
+
     /// Denoises the mean of all frames and puts it into the tiles that need no more.
     fn denoise_mean(
         &mut self,
@@ -215,16 +234,8 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
             let core = denoised.slice(s![.., .., top..top + rows.len(), left..left + columns.len()]);
             out.slice_mut(s![.., .., rows.clone(), columns.clone()]).assign(&core);
         }
-        let memory = self.memory.take().filter(|m| m.input.dim() == noisy.dim());
-        let mut memory =
-            memory.unwrap_or_else(|| Memory { stage: call.stage, input: noisy.to_owned(), output: out.to_owned() });
-        memory.stage = call.stage;
-        for (rows, columns) in of(Need::MeanFrame).into_iter().chain(of(Need::Frames)) {
-            let tile = s![.., .., rows, columns];
-            memory.input.slice_mut(tile).assign(&noisy.slice(tile));
-            memory.output.slice_mut(tile).assign(&out.slice(tile));
-        }
-        self.memory = Some(memory);
+        let worked_on = of(Need::MeanFrame).into_iter().chain(of(Need::Frames));
+        self.remember(call.stage, noisy, out.view(), worked_on);
         Ok(())
     }
 }

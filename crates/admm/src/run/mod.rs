@@ -75,6 +75,13 @@ struct Loop<'r> {
     backed_off: Option<BackOff>,
 }
 
+/// What comes after an iteration.
+enum Look {
+    GoOn,
+    EndStage,
+    Stop(StopReason),
+}
+
 /// How a stage ended.
 enum StageEnd {
     /// With so many iterations left over.
@@ -155,33 +162,46 @@ impl<'r> Loop<'r> {
                 }
                 return Ok(StageEnd::Stop(StopReason::Diverged));
             };
-            let judged = self.judge.as_mut().map(|judge| judge.judge(&self.current, left == 0));
-            let (predicted_error, verdict) = judged.unzip();
-            let seconds = self.clock.pause().as_secs_f64();
-            let info = IterInfo {
-                iteration: call.iteration,
-                stage: index,
-                sigma: stage.sigma,
-                estimate: &self.current,
-                relative_residual: self.relative_residual,
-                relative_change,
-                predicted_error,
-                seconds,
-            };
-            let iteration = call.iteration;
-            let observed = observe(&info).map_err(|source| SolveError::Observer { iteration, source })?;
-            match (observed, verdict) {
-                (ControlFlow::Break(()), _) => return Ok(StageEnd::Stop(StopReason::Observer)),
-                (_, Some(Verdict::Stop)) => return Ok(StageEnd::Stop(StopReason::Stalled)),
-                _ if relative_change < self.stop.relative_change => return Ok(StageEnd::Stop(StopReason::Converged)),
-                _ if self.stop.time.is_some_and(|limit| self.clock.elapsed() >= limit) => {
-                    return Ok(StageEnd::Stop(StopReason::TimeUp));
-                }
-                (_, Some(Verdict::EndStage)) => return Ok(StageEnd::Done { left }),
-                _ => {}
+            match self.look(&call, relative_change, left == 0, observe)? {
+                Look::GoOn => {}
+                Look::EndStage => return Ok(StageEnd::Done { left }),
+                Look::Stop(reason) => return Ok(StageEnd::Stop(reason)),
             }
         }
         Ok(StageEnd::Done { left: 0 })
+    }
+
+    /// After an iteration: what the held-out pixels, the observer and the stop rule say of it.
+    fn look(
+        &mut self,
+        call: &Call<'_>,
+        relative_change: f64,
+        last_of_stage: bool,
+        observe: &mut Observe<'_>,
+    ) -> Result<Look, SolveError> {
+        let judged = self.judge.as_mut().map(|judge| judge.judge(&self.current, last_of_stage));
+        let (predicted_error, verdict) = judged.unzip();
+        let time = self.clock.pause();
+        let iteration = call.iteration;
+        let info = IterInfo {
+            iteration,
+            stage: call.stage,
+            sigma: call.sigma,
+            estimate: &self.current,
+            relative_residual: self.relative_residual,
+            relative_change,
+            predicted_error,
+            seconds: time.as_secs_f64(),
+        };
+        let observed = observe(&info).map_err(|source| SolveError::Observer { iteration, source })?;
+        Ok(match (observed, verdict) {
+            (ControlFlow::Break(()), _) => Look::Stop(StopReason::Observer),
+            (_, Some(Verdict::Stop)) => Look::Stop(StopReason::Stalled),
+            _ if relative_change < self.stop.relative_change => Look::Stop(StopReason::Converged),
+            _ if self.stop.time.is_some_and(|limit| time >= limit) => Look::Stop(StopReason::TimeUp),
+            (_, Some(Verdict::EndStage)) => Look::EndStage,
+            _ => Look::GoOn,
+        })
     }
 
     /// One iteration; returns the relative change. Nothing if what came out has diverged: `current` is then as it was.
