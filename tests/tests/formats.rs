@@ -141,7 +141,7 @@ fn every_output_reads_back_as_the_result() {
         let mut names: Vec<_> = fs::read_dir(bench.path(format)).unwrap().map(|e| e.unwrap().file_name()).collect();
         names.sort();
         let result = format!("recon.{format}");
-        assert_eq!(names, ["frames", "preview.gif", &result, "record.json", "report.html"]);
+        assert_eq!(names, ["frames", "preview.gif", result.as_str(), "record.json", "report.html"]);
     }
     let truth = psnr(&bench, "npy/recon.npy", "clip.y4m");
     let recorded = bench.record("npy")["mean"]["psnr_db"].as_f64().unwrap();
