@@ -1,4 +1,4 @@
-//! What the end-to-end tests share: the built `sci`, a folder to run it in, and the data they need if it is there.
+//! What the end-to-end tests share: the built `sci` and a folder to run it in. Their data is found by `test_data`.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -37,17 +37,6 @@ pub fn sci() -> &'static Path {
             .find_map(|message| message["executable"].as_str().map(PathBuf::from))
             .expect("cargo names the binary it built")
     })
-}
-
-/// The folder with data/ and weights/ that `SCI_DATA` names, else `../shared`; says why a test is skipped without it.
-pub fn data_root() -> Option<PathBuf> {
-    let named = std::env::var_os("SCI_DATA").map(PathBuf::from);
-    let root = named.unwrap_or_else(|| workspace().join("../shared"));
-    if root.is_dir() {
-        return Some(root);
-    }
-    eprintln!("skipped: no scenes at {} (set SCI_DATA to a folder with data/ and weights/)", root.display());
-    None
 }
 
 /// An experiment of `configs`, on the demo's video through a mask (the keys of `[data.mask]`).
@@ -131,6 +120,19 @@ impl Bench {
     /// If it does not start or is killed.
     pub fn sci<S: AsRef<OsStr>>(&self, args: &[S]) -> Finished {
         self.finish(&mut self.command(args))
+    }
+
+    /// Runs a file of `configs` on measurement 0 into `out`, with these settings and the scenes and weights of `data`.
+    ///
+    /// # Panics
+    /// If `sci` does not start or is killed.
+    pub fn run_on(&self, data: &Path, config: &str, settings: &[&str]) -> Finished {
+        let mut command = self.command(&["run", "--out", "out", "--set", "data.measurements=[0]"]);
+        command.arg(workspace().join("configs").join(config)).env("SCI_DATA", data);
+        settings.iter().for_each(|setting| {
+            command.args(["--set", setting]);
+        });
+        self.finish(&mut command)
     }
 
     /// Runs a command to its end.

@@ -1,30 +1,34 @@
 //! Color scenes: every shipped config, the numbers of the reference code, and that the pattern does not matter.
 
-use e2e::{Bench, data_root, workspace};
+use std::path::{Path, PathBuf};
+
+use e2e::{Bench, workspace};
+use ndarray::{Array3, Array4, s};
+use ndarray_npy::{NpzReader, WriteNpyExt};
 use serde_json::Value;
 
-/// Runs measurement 0 of a scene under a config of `configs/color`, where the data is there.
-fn measurement(config: &str, scene: &str, set: &[&str]) -> Option<Value> {
-    let root = data_root()?;
+/// Measurement 0 of a scene under a config of `configs/color`.
+fn measurement(root: &Path, config: &str, scene: &Path, set: &[&str]) -> Value {
     let bench = Bench::new();
-    let mut command = bench.command(&["run", "--out", "out", "--set", "data.measurements=[0]"]);
-    command.arg("--set").arg(format!("data.path={scene}"));
-    set.iter().for_each(|s| {
-        command.args(["--set", s]);
-    });
-    command.arg(workspace().join("configs/color").join(config)).env("SCI_DATA", root);
-    let run = bench.finish(&mut command);
+    let path = format!("data.path={}", scene.display());
+    let run = bench.run_on(root, &format!("color/{config}"), &[&[path.as_str()], set].concat());
     assert_eq!(run.code, 0, "{}", run.stderr);
     assert!(bench.path("out/report.html").is_file() && bench.path("out/preview.gif").is_file());
-    Some(bench.record("out")["measurements"][0].take())
+    bench.record("out")["measurements"][0].take()
 }
 
-fn slow() -> bool {
-    let slow = std::env::var_os("RUN_SLOW_TESTS").is_some();
-    if !slow {
-        eprintln!("skipped: takes minutes (set RUN_SLOW_TESTS=1)");
-    }
-    slow
+/// The first measurement of a scene, 160×160 pixels of it from row and column 160 on, as a folder in `bench`.
+fn crop(bench: &Bench, root: &Path, scene: &str) -> PathBuf {
+    let file = std::fs::File::open(root.join("data").join(scene)).unwrap();
+    let mut scene = NpzReader::new(file).unwrap();
+    let rgb: Array4<u8> = scene.by_name("rgb").unwrap();
+    let mask: Array3<u8> = scene.by_name("mask").unwrap();
+    let folder = bench.path("crop");
+    std::fs::create_dir_all(&folder).unwrap();
+    let file = |name: &str| std::fs::File::create(folder.join(name)).unwrap();
+    rgb.slice(s![..8, 160..320, 160..320, ..]).write_npy(file("rgb.npy")).unwrap();
+    mask.slice(s![.., 160..320, 160..320]).write_npy(file("mask.npy")).unwrap();
+    folder
 }
 
 #[track_caller]
@@ -39,67 +43,58 @@ const NO_ITERATION: [&str; 4] =
     ["stage.0.iterations=0", "stage.1.iterations=0", "stage.2.iterations=0", "stage.3.iterations=0"];
 
 #[test]
-fn tv_start_calendar() {
-    let Some(m) = measurement("two-stage-ffdnet.toml", "calendar.npz", &NO_ITERATION) else { return };
-    close(&m, 16.5317, 0.5466);
+fn tv_start() {
+    let Some(root) = test_data::root() else { return };
+    for (scene, psnr, ssim) in [("calendar.npz", 16.5317, 0.5466), ("walk.npz", 20.9675, 0.7233)] {
+        close(&measurement(&root, "two-stage-ffdnet.toml", scene.as_ref(), &NO_ITERATION), psnr, ssim);
+    }
 }
 
-#[test]
-fn tv_start_walk() {
-    let Some(m) = measurement("two-stage-ffdnet.toml", "walk.npz", &NO_ITERATION) else { return };
-    close(&m, 20.9675, 0.7233);
-}
+/// PSNR and SSIM of the reference's two-stage ADMM with FFDNet on a [`crop`] of each scene.
+const REFERENCE: [(&str, f64, f64); 2] = [("calendar.npz", 0.0, 0.0), ("walk.npz", 0.0, 0.0)];
 
 #[test]
 fn two_stage_ffdnet() {
-    if !slow() {
-        return;
-    }
-    for (scene, psnr, ssim) in [("calendar.npz", 16.8910, 0.6648), ("walk.npz", 22.9899, 0.8434)] {
-        let Some(m) = measurement("two-stage-ffdnet.toml", scene, &[]) else { return };
-        close(&m, psnr, ssim);
+    let Some(root) = test_data::root() else { return };
+    let bench = Bench::new();
+    for (scene, psnr, ssim) in REFERENCE {
+        close(&measurement(&root, "two-stage-ffdnet.toml", &crop(&bench, &root, scene), &[]), psnr, ssim);
     }
 }
 
 /// One default for every scene is well above the reference, in fewer denoiser calls.
 #[test]
 fn default_beats_the_reference() {
-    if !slow() {
-        return;
-    }
-    for (scene, least) in [("calendar.npz", 16.89 + 3.1), ("walk.npz", 22.99 + 3.3)] {
-        let Some(m) = measurement("default.toml", scene, &[]) else { return };
-        assert!(m["psnr_db"].as_f64().unwrap() >= least, "{scene}: {}, at least {least}", m["psnr_db"]);
+    let Some(root) = test_data::root() else { return };
+    let bench = Bench::new();
+    for ((scene, reference, _), gain) in REFERENCE.into_iter().zip([3.1, 3.3]) {
+        let m = measurement(&root, "default.toml", &crop(&bench, &root, scene), &[]);
+        assert!(m["psnr_db"].as_f64().unwrap() >= reference + gain, "{scene}: {}, reference {reference}", m["psnr_db"]);
         assert!(m["denoiser_calls"].as_u64().unwrap() < 20, "{}", m["denoiser_calls"]);
     }
 }
 
-/// Every config is legal but for the weights that it names as missing.
+/// Every config is legal, and what it names is there.
 #[test]
-fn configs_resolve_or_name_what_is_missing() {
-    let Some(root) = data_root() else { return };
+fn configs_resolve() {
+    let Some(root) = test_data::root() else { return };
     let bench = Bench::new();
-    for folder in ["configs/color", "configs/gray"] {
-        for entry in std::fs::read_dir(workspace().join(folder)).unwrap() {
+    for folder in ["color", "gray", "bench"] {
+        for entry in std::fs::read_dir(workspace().join("configs").join(folder)).unwrap() {
             let path = entry.unwrap().path();
-            let text = std::fs::read_to_string(&path).unwrap();
             // A measurement that is not there ends the run after everything was resolved.
-            let mut command = bench.command(&["run", "--out", "out", "--set", "data.measurements=[9]"]);
-            let run = bench.finish(command.arg(&path).env("SCI_DATA", &root));
+            let run = bench.run_on(&root, path.to_str().unwrap(), &["data.measurements=[9]"]);
             assert_eq!(run.code, 2, "{}: {}", path.display(), run.stderr);
-            let missing = text.contains("bundled:") && run.stderr.contains("bundled:");
-            assert!(missing || run.stderr.contains("`data.measurements` names 9"), "{}", run.stderr);
+            assert!(run.stderr.contains("`data.measurements` names 9"), "{}", run.stderr);
         }
     }
 }
 
 #[test]
 fn gray_weights_on_a_color_scene() {
-    let Some(root) = data_root() else { return };
+    let Some(root) = test_data::root() else { return };
     let bench = Bench::new();
-    let mut command = bench.command(&["run", "--out", "out", "--set", "denoiser.weights=ffdnet_gray.pth"]);
-    let run =
-        bench.finish(command.arg(workspace().join("configs/color/two-stage-ffdnet-fast.toml")).env("SCI_DATA", root));
+    let run = bench.run_on(&root, "color/two-stage-ffdnet-fast.toml", &["denoiser.weights=ffdnet_gray.pth"]);
     assert_eq!(run.code, 1);
     assert!(run.stderr.contains("1 channels") && run.stderr.contains("scene is color"), "{}", run.stderr);
 }
@@ -123,7 +118,7 @@ weight = 0.05
 iterations = 30
 "#;
     let bench = Bench::new();
-    let video = ndarray::Array4::from_shape_fn((4, 3, 33, 31), |(t, c, y, x)| {
+    let video = Array4::from_shape_fn((4, 3, 33, 31), |(t, c, y, x)| {
         0.5 + 0.3 * (0.2 * (x + t) as f32 + c as f32).sin() * (0.15 * y as f32).cos()
     });
     bench.write("a.toml", config);
@@ -133,7 +128,7 @@ iterations = 30
         assert_eq!(run.code, 0, "{cfa}: {}", run.stderr);
         let m = &bench.record("out")["measurements"][0];
         assert!(m["psnr_db"].as_f64().unwrap() > 25.0 && m["psnr_rgb_db"].as_f64().unwrap() > 25.0, "{cfa}: {m}");
-        let recon: ndarray::Array4<f32> = ndarray_npy::read_npy(bench.path("out/recon.npy")).unwrap();
+        let recon: Array4<f32> = ndarray_npy::read_npy(bench.path("out/recon.npy")).unwrap();
         assert_eq!(recon.dim(), video.dim());
     }
 }
@@ -141,7 +136,7 @@ iterations = 30
 /// Without a penalty to speak of, two-stage ADMM diverges: a failure that says what to do and leaves the last good estimate.
 #[test]
 fn divergence_is_a_failure_with_a_result() {
-    let Some(root) = data_root() else { return };
+    let Some(root) = test_data::root() else { return };
     let bench = Bench::new();
     let config = "[data]\npath = 'walk.npz'\nmeasurements = [0]\n[solver]\nkind = 'two-stage'\nrho = 1e-6\n\
                   [denoiser]\nkind = 'tv'\nweight = 0.1\n[[stage]]\niterations = 12\n";

@@ -14,7 +14,7 @@ fn browser() -> Option<PathBuf> {
         std::env::split_paths(&path).flat_map(|dir| names.map(|n| dir.join(n))).find(|p| p.is_file())
     });
     if found.is_none() {
-        eprintln!("skipped: no chromium, chromium-browser or google-chrome on the PATH (or name one in SCI_BROWSER)");
+        test_data::skip("no chromium, chromium-browser or google-chrome on the PATH (SCI_BROWSER may name one)");
     }
     found
 }

@@ -7,7 +7,9 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 
-use crate::workspace::{built_sci, cargo, cpu, json_lines, median, output, range, results_dir, revision, root, shared};
+use crate::workspace::{
+    built_sci, cargo, cpu, json_lines, median, output, range, results_dir, revision, root, sci_run, shared,
+};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -82,8 +84,12 @@ pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
     let peer = options.peer_script()?;
     let sci = built_sci()?;
     let (mut ours, mut theirs) = (Side::default(), Side::default());
+    let config = root().join(format!("configs/gray/{name}.toml"));
+    let mut sets = vec![format!("data.path={}", scene.display()), "data.measurements=[0]".into()];
+    sets.extend(weights.as_ref().map(|w| format!("denoiser.weights={}", w.display())));
+    let out = std::env::temp_dir().join(format!("sci-bench-{}", std::process::id()));
     for _ in 0..options.runs {
-        let record = run_sci(&sci, name, &scene, weights.as_deref())?;
+        let record = sci_run(&sci, &config, &sets, &out)?.success()?;
         let m = &record["measurements"][0];
         ours.push(&m["seconds"], &m["psnr_db"], &m["ssim"])?;
         if let Some((python, script)) = &peer {
@@ -92,6 +98,7 @@ pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
             theirs.push(&r["seconds"], &r["psnr"], &r["ssim"])?;
         }
     }
+    let _ = fs::remove_dir_all(&out);
     println!("{name} on {}, measurement 0", options.scene);
     println!("{}", ours.line("sci"));
     let mut result = json!({ "benchmark": name, "scene": options.scene, "sci": ours.json() });
@@ -103,20 +110,6 @@ pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
         result["ratio"] = json!(ratio);
     }
     save(name, result, options)
-}
-
-fn run_sci(sci: &Path, name: &str, scene: &Path, weights: Option<&Path>) -> anyhow::Result<Value> {
-    let out = std::env::temp_dir().join(format!("sci-bench-{}", std::process::id()));
-    let mut run = Command::new(sci);
-    run.arg("run").arg(root().join(format!("configs/gray/{name}.toml"))).arg("--out").arg(&out);
-    run.arg("--set").arg(format!("data.path={}", scene.display())).args(["--set", "data.measurements=[0]"]);
-    if let Some(weights) = weights {
-        run.arg("--set").arg(format!("denoiser.weights={}", weights.display()));
-    }
-    output(&mut run)?;
-    let record = fs::read_to_string(out.join("record.json"))?;
-    fs::remove_dir_all(&out)?;
-    Ok(serde_json::from_str(&record)?)
 }
 
 /// `cargo bench -p nets --bench kernels` (ours and candle's convolutions, the peak of a matrix product) beside `peer.py conv`,

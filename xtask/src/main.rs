@@ -25,8 +25,8 @@ enum Task {
     Repro(repro::Options),
     /// Feed every solver what no one should feed it, and print how each case ended
     Stress(stress::Options),
-    /// Read a million damaged files and experiments
-    Fuzz,
+    /// Read damaged files and experiments, more than a million
+    Fuzz(stress::Fuzz),
 }
 
 #[derive(Subcommand)]
@@ -48,7 +48,7 @@ fn main() -> anyhow::Result<()> {
         Task::Tidy => tidy::run(),
         Task::Repro(options) => repro::run(&options),
         Task::Stress(options) => stress::run(&options),
-        Task::Fuzz => stress::fuzz(),
+        Task::Fuzz(options) => stress::fuzz(&options),
         Task::Bench(Bench::GapTv(options)) => bench::solver("gap-tv", &options),
         Task::Bench(Bench::GapFfdnet(options)) => bench::solver("gap-ffdnet", &options),
         Task::Bench(Bench::Kernels(options)) => bench::kernels(&options),

@@ -11,7 +11,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
-use crate::workspace::{built_sci, cpu, json_lines, median, output, range, results_dir, revision, sci_run, shared};
+use crate::workspace::{
+    built_sci, cpu, json_lines, median, output, range, results_dir, revision, root, sci_run, shared,
+};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -47,108 +49,99 @@ enum Suite {
     Color,
 }
 
-/// One line of the plot: an experiment, and what its budget scales.
+/// One line of the plot: an experiment that ships, and what its budget scales.
 struct Curve {
     name: &'static str,
-    /// TOML without `[data]` and stages.
-    experiment: &'static str,
+    /// A file of `configs`.
+    config: &'static str,
+    /// What is different, as for `--set`.
+    settings: &'static [&'static str],
+    /// A file of weights/ in the place of the experiment's.
     weights: Option<&'static str>,
-    /// σ of the stages, in 0..255 units; one stage without σ if there are none.
+    /// σ of the stages, in 0..255 units, each with the iterations of the budget; with none, the experiment's own stages, the
+    /// last with the iterations of the budget.
     sigmas: &'static [f32],
-    /// σ of the stages of WNNM after them; with any, those before take one iteration each.
-    refined: &'static [f32],
-    /// Iterations of each stage.
     budgets: &'static [usize],
 }
 
 const SIGMAS: &[f32] = &[50.0, 25.0, 12.0, 6.0];
+/// Of the networks that were trained on a solver's iterates.
+const FOR_ITERATES: &[f32] = &[20.0, 14.0, 10.0, 7.0];
 const TV: &[usize] = &[4, 8, 16, 40, 80];
 const NET: &[usize] = &[1, 2, 3, 5, 10];
-/// The networks that know a solver's iterates, and the σ they were trained for.
-const GRAY_FOR_ITERATES: &str = "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_gray_sci'\nprecision = 'bf16'\nflips = true\n";
-const GRAY_ITERATES: &[f32] = &[20.0, 18.0, 17.0, 16.0, 15.0, 14.0, 13.0, 12.0, 10.0, 9.0, 8.0, 7.0];
-const COLOR_FOR_ITERATES: &str = "[solver]\nkind = 'gap'\nstart = 'tv'\nstart_iterations = 20\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'bundled:fastdvdnet_color_sci'\nprecision = 'bf16'\nflips = true\n";
-const COLOR_ITERATES: &[f32] = &[20.0, 18.0, 16.0, 14.0, 12.0, 10.0, 8.0, 7.0];
 
 const GRAY: &[Curve] = &[
     Curve {
         name: "GAP-TV, reference",
-        experiment: "[solver]\nkind = 'gap'\nmomentum = 'zero'\nstart = 'adjoint'\n[denoiser]\nkind = 'tv'\nweight = 0.3\n",
+        config: "gray/gap-tv.toml",
+        settings: &[],
         weights: None,
         sigmas: &[],
-        refined: &[],
         budgets: TV,
     },
-    Curve {
-        name: "GAP-TV",
-        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'tv'\nweight = 0.15\n",
-        weights: None,
-        sigmas: &[],
-        refined: &[],
-        budgets: TV,
-    },
+    Curve { name: "GAP-TV", config: "gray/gap-tv-fast.toml", settings: &[], weights: None, sigmas: &[], budgets: TV },
     Curve {
         name: "ADMM-TV",
-        experiment: "[solver]\nkind = 'admm'\n[denoiser]\nkind = 'tv'\nweight = 0.15\n",
+        config: "gray/gap-tv-fast.toml",
+        settings: &["solver={kind='admm'}"],
         weights: None,
         sigmas: &[],
-        refined: &[],
         budgets: TV,
     },
     Curve {
         name: "GAP-FFDNet, reference",
-        experiment: "[solver]\nkind = 'gap'\nmomentum = 'zero'\nstart = 'adjoint'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "gray/gap-ffdnet.toml",
+        settings: &[],
         weights: Some("ffdnet_gray_ipol.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: NET,
     },
     Curve {
         name: "GAP-FFDNet",
-        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "gray/gap-ffdnet-fast.toml",
+        settings: &[],
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: NET,
     },
     Curve {
         name: "plain GAP-FFDNet",
-        experiment: "[solver]\nkind = 'gap'\naccelerate = false\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "gray/gap-ffdnet-fast.toml",
+        settings: &["solver={kind='gap', accelerate=false}"],
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: NET,
     },
     Curve {
         name: "ADMM-FFDNet",
-        experiment: "[solver]\nkind = 'admm'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "gray/gap-ffdnet-fast.toml",
+        settings: &["solver={kind='admm'}"],
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: NET,
     },
     Curve {
         name: "GAP-FFDNet, [skip]",
-        experiment: "[skip]\n[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "gray/gap-ffdnet-fast.toml",
+        settings: &["skip.enabled=true"],
         weights: Some("ffdnet_gray.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: &[5, 10],
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: GRAY_FOR_ITERATES,
+        config: "gray/default.toml",
+        settings: &[],
         weights: None,
-        sigmas: &[20.0, 14.0, 10.0, 7.0],
-        refined: &[],
+        sigmas: FOR_ITERATES,
         budgets: &[1, 2, 3],
     },
     Curve {
         name: "GAP-FastDVDnet for iterates, then WNNM",
-        experiment: GRAY_FOR_ITERATES,
+        config: "gray/refined.toml",
+        settings: &[],
         weights: None,
-        sigmas: GRAY_ITERATES,
-        refined: &[12.0, 8.0],
+        sigmas: &[],
         budgets: &[1, 2, 4, 6],
     },
 ];
@@ -156,58 +149,58 @@ const GRAY: &[Curve] = &[
 const COLOR: &[Curve] = &[
     Curve {
         name: "GAP-TV",
-        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'tv'\nweight = 0.1\n",
+        config: "color/gap-tv.toml",
+        settings: &["solver={kind='gap'}"],
         weights: None,
         sigmas: &[],
-        refined: &[],
         budgets: TV,
     },
     Curve {
         name: "GAP-FFDNet, Menon",
-        experiment: "[solver]\nkind = 'gap'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "color/gap-ffdnet.toml",
+        settings: &[],
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
         name: "two-stage FFDNet, paper",
-        experiment: "[solver]\nkind = 'two-stage'\nstart_iterations = 40\nstart = 'tv'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "color/two-stage-ffdnet.toml",
+        settings: &[],
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
         name: "two-stage FFDNet, scaled",
-        experiment: "[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "color/two-stage-ffdnet-fast.toml",
+        settings: &[],
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: &[1, 2, 4],
     },
     Curve {
         name: "two-stage FFDNet, scaled, [skip]",
-        experiment: "[skip]\n[solver]\nkind = 'two-stage'\nconvention = 'scaled'\nrho = 0.3\ndemosaicer = 'menon'\n[denoiser]\nkind = 'ffdnet'\n",
+        config: "color/two-stage-ffdnet-fast.toml",
+        settings: &["skip.enabled=true"],
         weights: Some("ffdnet_color.pth"),
         sigmas: SIGMAS,
-        refined: &[],
         budgets: &[4],
     },
     Curve {
         name: "GAP-FastDVDnet for iterates",
-        experiment: COLOR_FOR_ITERATES,
+        config: "color/default.toml",
+        settings: &[],
         weights: None,
-        sigmas: &[20.0, 14.0, 10.0, 7.0],
-        refined: &[],
+        sigmas: FOR_ITERATES,
         budgets: &[1, 2, 3],
     },
     Curve {
         name: "GAP-FastDVDnet for iterates, then WNNM",
-        experiment: COLOR_FOR_ITERATES,
+        config: "color/refined.toml",
+        settings: &[],
         weights: None,
-        sigmas: COLOR_ITERATES,
-        refined: &[12.0, 8.0],
+        sigmas: &[],
         budgets: &[1, 2, 4, 6],
     },
 ];
@@ -330,8 +323,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
 /// Every curve at every budget on every scene once, the peers too.
 fn round(options: &Options, sci: &Path, results: &mut Results) -> anyhow::Result<()> {
     let shared = shared(options.shared.as_deref())?;
-    let dir = std::env::temp_dir().join(format!("sci-pareto-{}", std::process::id()));
-    fs::create_dir_all(&dir)?;
+    let out = std::env::temp_dir().join(format!("sci-pareto-{}", std::process::id()));
     let wanted = |name: &str, filter: &Option<String>| filter.as_ref().is_none_or(|f| name.contains(f.as_str()));
     for scene in options.suite.scenes().iter().filter(|s| wanted(s.file, &options.scene)) {
         let data = shared.join("data").join(scene.file);
@@ -344,14 +336,17 @@ fn round(options: &Options, sci: &Path, results: &mut Results) -> anyhow::Result
                 for variant in
                     [None, options.variant.as_deref()].iter().take(1 + usize::from(options.variant.is_some()))
                 {
-                    let config = dir.join("pareto.toml");
-                    fs::write(&config, experiment(curve, budget, &data, &shared))?;
-                    let sets: Vec<String> = variant.iter().map(|v| (*v).to_owned()).collect();
-                    let finished = sci_run(sci, &config, &sets, &dir.join("out"))?;
-                    let record = finished.record.filter(|_| finished.code == Some(0));
-                    let Some(record) = record else {
-                        println!("{} × {budget} on {}: {}", curve.name, scene.file, finished.stderr.trim());
-                        continue;
+                    let mut sets = curve.settings(budget)?;
+                    sets.push(format!("data.path={}", data.display()));
+                    let weights = curve.weights.map(|file| shared.join("weights").join(file));
+                    sets.extend(weights.map(|path| format!("denoiser.weights={}", path.display())));
+                    sets.extend(variant.map(str::to_owned));
+                    let record = match sci_run(sci, &curve.file(), &sets, &out)?.success() {
+                        Ok(record) => record,
+                        Err(e) => {
+                            println!("{} × {budget} on {}: {e}", curve.name, scene.file);
+                            continue;
+                        }
                     };
                     let name = variant.map_or(curve.name.to_owned(), |v| format!("{}, {v}", curve.name));
                     results.push(point(scene.file, name, &record)?);
@@ -364,22 +359,30 @@ fn round(options: &Options, sci: &Path, results: &mut Results) -> anyhow::Result
             }
         }
     }
-    fs::remove_dir_all(&dir)?;
+    let _ = fs::remove_dir_all(&out);
     Ok(())
 }
 
-fn experiment(curve: &Curve, budget: usize, data: &Path, shared: &Path) -> String {
-    let mut text = format!("[data]\npath = '{}'\nmeasurements = [0]\n{}", data.display(), curve.experiment);
-    if let Some(weights) = curve.weights {
-        text += &format!("weights = '{}'\n", shared.join("weights").join(weights).display());
+impl Curve {
+    fn file(&self) -> PathBuf {
+        root().join("configs").join(self.config)
     }
-    let stage = |sigmas: &[f32], iterations| format!("[[stage]]\nsigma = {sigmas:?}\niterations = {iterations}\n");
-    text += &match (curve.sigmas, curve.refined) {
-        ([], _) => format!("[[stage]]\niterations = {budget}\n"),
-        (sigmas, []) => stage(sigmas, budget),
-        (sigmas, refined) => stage(sigmas, 1) + &stage(refined, budget) + "[stage.denoiser]\nkind = 'wnnm'\n",
-    };
-    text + "[output]\nframes = false\npreview = false\n"
+
+    /// What makes its file the experiment at a budget, as for `--set`.
+    fn settings(&self, budget: usize) -> anyhow::Result<Vec<String>> {
+        let mut settings: Vec<String> = self.settings.iter().map(|s| (*s).to_owned()).collect();
+        settings.push(if self.sigmas.is_empty() {
+            let text = fs::read_to_string(self.file()).with_context(|| self.config)?;
+            let file: toml::Table = text.parse().with_context(|| self.config)?;
+            let stages = file.get("stage").and_then(|s| s.as_array()).map_or(0, Vec::len);
+            let last = stages.checked_sub(1).with_context(|| format!("{}: no [[stage]]", self.config))?;
+            format!("stage.{last}.iterations={budget}")
+        } else {
+            format!("stage=[{{ sigma = {:?}, iterations = {budget} }}]", self.sigmas)
+        });
+        settings.extend(["data.measurements=[0]", "output.frames=false", "output.preview=false"].map(String::from));
+        Ok(settings)
+    }
 }
 
 fn point(scene: &str, curve: String, record: &Value) -> anyhow::Result<Point> {
@@ -557,6 +560,19 @@ mod tests {
     fn the_front_leaves_out_what_is_beaten_and_goes_in_steps() {
         let points = [(2.0, 25.0), (1.0, 20.0), (3.0, 24.0), (1.0, 19.0), (4.0, 26.0)];
         assert_eq!(front(&points), [(1.0, 20.0), (2.0, 20.0), (2.0, 25.0), (4.0, 25.0), (4.0, 26.0)]);
+    }
+
+    /// Each curve at each budget is TOML, and has the stages that its experiment has, or those of its σ.
+    #[test]
+    fn every_curve_is_an_experiment() {
+        for curve in GRAY.iter().chain(COLOR) {
+            for setting in curve.settings(3).unwrap() {
+                let (key, value) = setting.split_once('=').unwrap();
+                assert!(format!("{key} = {value}").parse::<toml::Table>().is_ok(), "{}: {setting}", curve.name);
+            }
+        }
+        let refined = GRAY.iter().find(|c| c.config == "gray/refined.toml").unwrap();
+        assert!(refined.settings(4).unwrap().contains(&"stage.1.iterations=4".to_owned()));
     }
 
     #[test]

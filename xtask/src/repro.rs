@@ -153,8 +153,9 @@ fn cell(sci: &Path, shared: &Path, row: &Row, scene: &Scene) -> anyhow::Result<R
     let out = std::env::temp_dir().join(format!("sci-repro-{}", std::process::id()));
     let finished = sci_run(sci, &config, &sets, &out)?;
     let _ = fs::remove_dir_all(&out);
-    let Some(record) = finished.record.filter(|_| finished.code == Some(0)) else {
-        return Ok(Err(finished.stderr.lines().last().unwrap_or("failed").to_owned()));
+    let record = match finished.success() {
+        Ok(record) => record,
+        Err(e) => return Ok(Err(e.to_string().lines().last().unwrap_or("failed").to_owned())),
     };
     let mean = |key: &str| record["mean"][key].as_f64();
     Ok(match (mean("psnr_db"), mean("ssim"), mean("seconds")) {

@@ -72,8 +72,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
             sets.extend(options.scene.iter().map(|scene| format!("data.path={}", scene.display())));
             let name = format!("{}, {updates} updates", schedule.to_uppercase());
             let finished = sci_run(&sci, &root().join(CONFIG), &sets, &dir.join("out"))?;
-            let record = finished.record.filter(|_| finished.code == Some(0));
-            let record = record.with_context(|| format!("{name}: {}", finished.stderr.trim()))?;
+            let record = finished.success().with_context(|| name.clone())?;
             runs.push(Run::read(name, &record)?);
         }
     }

@@ -43,8 +43,7 @@ pub(crate) fn json_lines(text: &str) -> impl Iterator<Item = Value> {
 
 /// The folder with data/, weights/ and peers/: as named, else `SCI_DATA`, else beside the repository.
 pub(crate) fn shared(named: Option<&Path>) -> anyhow::Result<PathBuf> {
-    let named = named.map(PathBuf::from).or_else(|| std::env::var_os("SCI_DATA").map(PathBuf::from));
-    let dir = named.unwrap_or_else(|| root().join("../shared"));
+    let dir = named.map_or_else(test_data::folder, PathBuf::from);
     dir.canonicalize().with_context(|| format!("{}: give --shared DIR", dir.display()))
 }
 
@@ -90,6 +89,14 @@ pub(crate) fn sci_run(sci: &Path, config: &Path, sets: &[String], out: &Path) ->
         stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
         record: record.map(|r| serde_json::from_str(&r)).transpose()?,
     })
+}
+
+impl Finished {
+    /// The record of a run that ended well; otherwise what it said.
+    pub(crate) fn success(self) -> anyhow::Result<Value> {
+        ensure!(self.code == Some(0), "{}", self.stderr.trim());
+        self.record.context("the run left no record")
+    }
 }
 
 pub(crate) fn range(values: &[f64]) -> (f64, f64) {

@@ -3,7 +3,7 @@
 use admm::*;
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use ndarray_npy::NpzReader;
-use sci_forward::testing::{moving_square, shared_file, uniform};
+use sci_forward::testing::{moving_square, uniform};
 use sci_forward::{MaskOperator, MaskStack, Measurement, MeasurementError, SensingOperator, VideoShape};
 use std::ops::ControlFlow;
 use std::sync::{Arc, Mutex};
@@ -48,7 +48,7 @@ impl<F: FnMut(&Call<'_>, ArrayView4<'_, f32>) -> Array4<f32> + Send> Denoiser fo
 
 #[test]
 fn tv_matches_scikit_image() {
-    let Some(path) = shared_file("golden/tv_chambolle.npz") else { return };
+    let Some(path) = test_data::file("golden/tv_chambolle.npz") else { return };
     let mut npz = NpzReader::new(std::fs::File::open(path).unwrap()).unwrap();
     let input: Array3<f32> = npz.by_name("input").unwrap();
     let expected: Array3<f32> = npz.by_name("output").unwrap();

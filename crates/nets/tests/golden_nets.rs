@@ -5,7 +5,6 @@ use candle_core::{Device, Tensor};
 use ndarray::{Array0, Array4, ArrayD, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
 use nets::{Ends, Fastdvdnet, Ffdnet, Network, WeightFile};
-use sci_forward::testing::shared_file;
 use std::fs::File;
 use std::path::Path;
 
@@ -44,10 +43,8 @@ fn assert_close(found: ArrayView4<'_, f32>, expected: ArrayView4<'_, f32>, toler
 
 #[test]
 fn ffdnet_gray_matches_pytorch_even_and_odd() {
-    let (Some(golden), Some(weights)) = (shared_file("golden/ffdnet_gray.npz"), shared_file("weights/ffdnet_gray.pth"))
-    else {
-        return;
-    };
+    let files = test_data::files(["golden/ffdnet_gray.npz", "weights/ffdnet_gray.pth"]);
+    let Some([golden, weights]) = files else { return };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
     assert_eq!(net.describe(), "FFDNet (gray, 64 channels, 15 layers)");
     for (input, sigma, output) in [("input", "sigma", "output"), ("odd_input", "odd_sigma", "odd_output")] {
@@ -59,11 +56,8 @@ fn ffdnet_gray_matches_pytorch_even_and_odd() {
 
 #[test]
 fn ffdnet_color_matches_pytorch() {
-    let (Some(golden), Some(weights)) =
-        (shared_file("golden/ffdnet_color.npz"), shared_file("weights/ffdnet_color.pth"))
-    else {
-        return;
-    };
+    let files = test_data::files(["golden/ffdnet_color.npz", "weights/ffdnet_color.pth"]);
+    let Some([golden, weights]) = files else { return };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
     let sigma = golden.number("sigma");
     let found = denoise(&mut net, &golden.video("input"), sigma);
@@ -72,11 +66,8 @@ fn ffdnet_color_matches_pytorch() {
 
 #[test]
 fn the_batch_norm_layout_removes_noise_and_folds_exactly() {
-    let (Some(golden), Some(weights)) =
-        (shared_file("golden/ffdnet_gray.npz"), shared_file("weights/ffdnet_gray_ipol.pth"))
-    else {
-        return;
-    };
+    let files = test_data::files(["golden/ffdnet_gray.npz", "weights/ffdnet_gray_ipol.pth"]);
+    let Some([golden, weights]) = files else { return };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
     assert_eq!(net.describe(), "FFDNet (gray, 64 channels, 15 layers, batch norm)");
     let (noisy, sigma) = (golden.video("input"), golden.number("sigma"));
@@ -97,15 +88,15 @@ fn published_files_are_recognised() {
         ("weights/ffdnet_gray_ipol.pth", "FFDNet (gray, 64 channels, 15 layers, batch norm)"),
         ("weights/fastdvdnet_half_color.pth", "FastDVDnet (color, 16/32/64 channels, batch norm)"),
     ] {
-        let Some(path) = shared_file(name) else { return };
+        let Some(path) = test_data::file(name) else { return };
         assert_eq!(WeightFile::read(&path).unwrap().architecture().unwrap().to_string(), what);
     }
 }
 
 #[test]
 fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
-    let weights = shared_file("weights/fastdvdnet_half_color.pth");
-    let (Some(golden), Some(weights)) = (shared_file("golden/fastdvdnet_half_color.npz"), weights) else { return };
+    let files = test_data::files(["golden/fastdvdnet_half_color.npz", "weights/fastdvdnet_half_color.pth"]);
+    let Some([golden, weights]) = files else { return };
     let mut net = Fastdvdnet::load(&weights, Ends::Circular).unwrap();
     let mut golden = Golden::open(&golden);
     let (noisy, sigma, expected) = (golden.video("input"), golden.number("sigma"), golden.video("output"));
@@ -120,8 +111,8 @@ fn fastdvdnet_matches_pytorch_with_batch_norm_and_folded() {
 
 #[test]
 fn gradients_of_the_measurement_loss_match_pytorch() {
-    let weights = shared_file("weights/ffdnet_gray.pth");
-    let (Some(golden), Some(weights)) = (shared_file("golden/online_gradient_gray.npz"), weights) else { return };
+    let files = test_data::files(["golden/online_gradient_gray.npz", "weights/ffdnet_gray.pth"]);
+    let Some([golden, weights]) = files else { return };
     let (mut golden, mut net) = (Golden::open(&golden), Ffdnet::load(&weights).unwrap());
     let (mask, y, input) = (golden.tensor("mask"), golden.tensor("y"), golden.tensor("input"));
     let vars = net.make_trainable().unwrap();

@@ -7,7 +7,6 @@ use nets::kernels::{
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
-use sci_forward::testing::shared_file;
 
 /// A convolution to check.
 #[derive(Debug, Clone, Copy)]
@@ -393,7 +392,7 @@ const BOUNDS_96: [(f64, f64); 3] = [(5.5e-5, 6e-6), (1.4e-5, 1.5e-6), (3.4e-4, 6
 
 #[test]
 fn agrees_with_pytorch() -> std::result::Result<(), Box<dyn std::error::Error>> {
-    let Some(path) = shared_file("golden/conv3x3.npz") else { return Ok(()) };
+    let Some(path) = test_data::file("golden/conv3x3.npz") else { return Ok(()) };
     let mut npz = ndarray_npy::NpzReader::new(std::fs::File::open(path)?)?;
     for k in 0..4 {
         let mut array = |name: &str| npz.by_name::<ndarray::OwnedRepr<f32>, ndarray::IxDyn>(&format!("{k}_{name}"));

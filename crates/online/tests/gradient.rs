@@ -7,7 +7,7 @@ use ndarray_npy::NpzReader;
 use nets::kernels::Isa;
 use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, Parameters};
 use online::{PixelSplit, accumulate_gradient};
-use sci_forward::testing::{gaussian, shared_file, uniform};
+use sci_forward::testing::{gaussian, uniform};
 use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
 use std::fs::File;
 use std::sync::Arc;
@@ -148,14 +148,12 @@ fn parts_of_the_parameters_have_the_same_gradient() {
 
 #[test]
 fn the_gradient_equals_pytorchs() {
+    // Before it is delegated, so that it is seen to be skipped.
+    let files = test_data::files(["golden/online_gradient_gray.npz", "weights/ffdnet_gray.pth"]);
+    let Some([golden, weights]) = files else { return };
     if delegated("the_gradient_equals_pytorchs") {
         return;
     }
-    let (Some(golden), Some(weights)) =
-        (shared_file("golden/online_gradient_gray.npz"), shared_file("weights/ffdnet_gray.pth"))
-    else {
-        return;
-    };
     let mut golden = NpzReader::new(File::open(golden).unwrap()).unwrap();
     let masks: Array3<f32> = golden.by_name("mask.npy").unwrap();
     let y: Array2<f32> = golden.by_name("y.npy").unwrap();

@@ -156,7 +156,7 @@ mod tests {
         let path = dir.path().join("r.html");
         write(&path, &record, &[]).unwrap();
         let page = std::fs::read_to_string(&path).unwrap();
-        assert!(page.contains("\\u003c/script>\\u003cb>") || page.contains("\\u003c/script>"), "the name is there");
+        assert!(page.contains("\\u003c/script>\\u003cb>"), "the name is there");
         assert_eq!(page.matches("</script>").count(), 2);
     }
 }

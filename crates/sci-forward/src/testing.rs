@@ -7,7 +7,6 @@ use ndarray::{
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
-use std::path::{Path, PathBuf};
 
 /// Independent values, uniform in `[0, 1)`.
 ///
@@ -181,23 +180,4 @@ impl SensingOperator for Sheared {
 
 fn norm<'a>(values: impl Iterator<Item = &'a f32>) -> f64 {
     values.map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt()
-}
-
-/// A file of the reference data (scenes, weights, golden outputs) that is not part of the repository, named relative to
-/// its folder as in `golden/metrics.npz`; looked for in `$SCI_DATA`, there also without its folder, then in `shared` beside
-/// the workspace.
-/// Prints why and returns nothing if it is absent, so that a test can skip.
-pub fn shared_file(name: &str) -> Option<PathBuf> {
-    let beside_workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
-    let found = std::env::var_os("SCI_DATA")
-        .map(PathBuf::from)
-        .into_iter()
-        .chain([beside_workspace])
-        .flat_map(|folder| [Some(folder.join(name)), Path::new(name).file_name().map(|file| folder.join(file))])
-        .flatten()
-        .find(|path| path.exists());
-    if found.is_none() {
-        println!("skipped: {name} is neither in $SCI_DATA nor in ../shared");
-    }
-    found
 }

@@ -5,7 +5,7 @@ use ndarray_npy::NpzReader;
 use sci_forward::bayer::{
     Bilinear, CfaPattern, Demosaicer, Malvar, Menon, mosaic_adjoint_into, mosaic_into, sub_lattice,
 };
-use sci_forward::testing::{gaussian, shared_file, uniform};
+use sci_forward::testing::{gaussian, uniform};
 
 fn demosaicers() -> [(&'static str, Box<dyn Demosaicer>); 3] {
     [("bilinear", Box::new(Bilinear)), ("malvar2004", Box::new(Malvar)), ("menon2007", Box::new(Menon))]
@@ -20,7 +20,7 @@ fn demosaic(method: &mut dyn Demosaicer, cfa: CfaPattern, mosaic: &Array3<f32>) 
 
 #[test]
 fn the_interior_matches_the_public_library() {
-    let Some(path) = shared_file("golden/demosaic_rggb.npz") else { return };
+    let Some(path) = test_data::file("golden/demosaic_rggb.npz") else { return };
     let mut npz = NpzReader::new(std::fs::File::open(path).unwrap()).unwrap();
     let mosaic: Array2<f32> = npz.by_name("mosaic").unwrap();
     let (h, w) = mosaic.dim();

@@ -2,11 +2,11 @@
 
 use ndarray::{Array1, Array3, ArrayView2};
 use ndarray_npy::NpzReader;
-use sci_forward::{metrics, testing::shared_file};
+use sci_forward::metrics;
 
 #[test]
 fn metrics_match_scikit_image() {
-    let Some(path) = shared_file("golden/metrics.npz") else { return };
+    let Some(path) = test_data::file("golden/metrics.npz") else { return };
     let mut npz = NpzReader::new(std::fs::File::open(path).unwrap()).unwrap();
     let reference: Array3<f32> = npz.by_name("reference").unwrap();
     let image: Array3<f32> = npz.by_name("image").unwrap();
