@@ -25,7 +25,7 @@ pub(crate) struct Options {
     /// Runs of each side
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: u32,
-    /// Keep the result as xtask/results/<cpu>/<benchmark>.json
+    /// Keep the result as xtask/results/CPU/BENCHMARK.json
     #[arg(long)]
     save: bool,
 }

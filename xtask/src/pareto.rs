@@ -38,7 +38,7 @@ pub(crate) struct Options {
     /// Rounds; each runs everything once, so that what is compared alternates; 0 only draws what is kept
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=100))]
     runs: u32,
-    /// Add to the results kept in xtask/results/<cpu>/, and draw the plots from all of them
+    /// Add to the results kept in xtask/results/CPU/, and draw the plots from all of them
     #[arg(long)]
     save: bool,
 }

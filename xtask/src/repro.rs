@@ -16,7 +16,7 @@ pub(crate) struct Options {
     /// Fail if a cell with an expected value is off it by more than configs/expected.toml tolerates
     #[arg(long)]
     check: bool,
-    /// Keep the table in xtask/results/<cpu>/
+    /// Keep the table in xtask/results/CPU/
     #[arg(long)]
     save: bool,
     /// Folder with data/ and weights/ [default: $SCI_DATA, else ../shared beside the repository]

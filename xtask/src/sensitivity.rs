@@ -15,7 +15,7 @@ pub(crate) struct Options {
     /// The scene, as data.path [default: that of configs/bench/sensitivity.toml]
     #[arg(long, value_name = "FILE")]
     scene: Option<PathBuf>,
-    /// Keep the plot and the table in xtask/results/<cpu>/
+    /// Keep the plot and the table in xtask/results/CPU/
     #[arg(long)]
     save: bool,
 }

@@ -15,7 +15,7 @@ pub(crate) struct Options {
     /// Folder with weights/, for the networks [default: $SCI_DATA, else ../shared beside the repository]
     #[arg(long, value_name = "DIR")]
     shared: Option<PathBuf>,
-    /// Keep table and plot as xtask/results/<cpu>/stress.md and drift.svg
+    /// Keep table and plot as xtask/results/CPU/stress.md and drift.svg
     #[arg(long)]
     save: bool,
 }

@@ -1,4 +1,4 @@
-//! Owns experiment files, in three steps and three types: [`file`] (what the TOML says, key by key, strict),
+//! Owns experiment files, in three steps and three types: [`mod@file`] (what the TOML says, key by key, strict),
 //! [`check`] (every value in range, every key with an effect), [`resolve`] (absolute paths, σ in `[0, 1]`).
 //!
 //! Only the last type reaches the rest of the program, so no other code has to doubt a value. An error names the file
