@@ -51,7 +51,7 @@ fn tv_start() {
 }
 
 /// PSNR and SSIM of the reference's two-stage ADMM with FFDNet on a [`crop`] of each scene.
-const REFERENCE: [(&str, f64, f64); 2] = [("calendar.npz", 0.0, 0.0), ("walk.npz", 0.0, 0.0)];
+const REFERENCE: [(&str, f64, f64); 2] = [("calendar.npz", 17.4173, 0.5728), ("walk.npz", 19.6384, 0.7686)];
 
 #[test]
 fn two_stage_ffdnet() {
@@ -67,7 +67,7 @@ fn two_stage_ffdnet() {
 fn default_beats_the_reference() {
     let Some(root) = test_data::root() else { return };
     let bench = Bench::new();
-    for ((scene, reference, _), gain) in REFERENCE.into_iter().zip([3.1, 3.3]) {
+    for ((scene, reference, _), gain) in REFERENCE.into_iter().zip([2.8, 5.0]) {
         let m = measurement(&root, "default.toml", &crop(&bench, &root, scene), &[]);
         assert!(m["psnr_db"].as_f64().unwrap() >= reference + gain, "{scene}: {}, reference {reference}", m["psnr_db"]);
         assert!(m["denoiser_calls"].as_u64().unwrap() < 20, "{}", m["denoiser_calls"]);
