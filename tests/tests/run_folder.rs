@@ -103,11 +103,14 @@ fn timeless(record: &Value) -> String {
     record.to_string()
 }
 
+fn page_data(page: &str) -> Value {
+    let (_, rest) = page.split_once("id=\"data\">").unwrap();
+    serde_json::from_str(rest.split_once("</script>").unwrap().0).unwrap()
+}
+
 fn timeless_page(page: &str) -> String {
-    let (head, rest) = page.split_once("id=\"data\">").unwrap();
-    let (data, tail) = rest.split_once("</script>").unwrap();
-    let data: Value = serde_json::from_str(data).unwrap();
-    format!("{head}{}{}{tail}", timeless(&data["runs"][0]), data["images"])
+    let data = page_data(page);
+    format!("{}{}", timeless(&data["runs"][0]), data["images"])
 }
 
 #[track_caller]
@@ -214,7 +217,7 @@ fn a_stopped_run_is_neither_thrown_away_nor_continued_by_another() {
     let bench = bench(6);
     stopped(&bench, "out");
     let same = ["--out", "out", "--set", "stage.0.iterations=400"];
-    refused(&bench, &same, &["1 measurement", "--resume", "--restart"]);
+    refused(&bench, &same, &["solved", "--resume", "--restart"]);
     let other = ["--out", "out", "--set", "stage.0.iterations=401", "--resume"];
     refused(&bench, &other, &["another one", "stage.0.iterations", "400", "401"]);
     let resumed = ok(&bench, &[&same[..], &["--resume"]].concat());
@@ -349,7 +352,10 @@ fn a_folder_that_cannot_be_written_is_found_out_before_anything_is_solved() {
     };
     let (said, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert_eq!(output.status.code(), Some(1), "{error}");
-    assert!(error.contains("cannot write") && error.contains("locked") && !said.contains("measurement  0"), "{said}{error}");
+    assert!(
+        error.contains("cannot write") && error.contains("locked") && !said.contains("measurement  0"),
+        "{said}{error}"
+    );
 }
 
 #[test]
@@ -424,7 +430,7 @@ fn the_page_of_a_run_is_made_again_from_its_folder() {
     fs::remove_file(bench.path("out/report.html")).unwrap();
     let made = bench.sci(&["report", "out"]);
     assert_eq!(made.code, 0, "{}", made.stderr);
-    let images = |page: &str| timeless_page(page);
+    let images = |page: &str| page_data(page)["images"].clone();
     assert!(images(&fs::read_to_string(bench.path("out/report.html")).unwrap()) == images(&page));
     // Without the scene there are the results.
     fs::remove_dir_all(bench.path("scene")).unwrap();
@@ -438,11 +444,18 @@ fn the_page_of_a_run_is_made_again_from_its_folder() {
 fn a_report_keeps_its_size() {
     let bench = Bench::new();
     let config = workspace().join("configs/demo.toml").display().to_string();
-    let run = bench.sci(&["run", &config, "--out", "run", "--set", "stage.0.iterations=2", "--set", "output.report_megabytes=1"]);
+    let run = bench.sci(&[
+        "run",
+        &config,
+        "--out",
+        "run",
+        "--set",
+        "stage.0.iterations=2",
+        "--set",
+        "output.report_megabytes=1",
+    ]);
     assert_eq!(run.code, 0, "{}", run.stderr);
     let page = fs::read_to_string(bench.path("run/report.html")).unwrap();
     assert!(page.len() < 1_100_000, "{} bytes", page.len());
-    let (_, data) = page.split_once("id=\"data\">").unwrap();
-    let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
-    assert!(data["images"][0]["step"].as_u64() > Some(1), "frames are left out");
+    assert!(page_data(&page)["images"][0]["step"].as_u64() > Some(1), "frames are left out");
 }

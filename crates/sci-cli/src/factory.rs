@@ -183,7 +183,8 @@ impl<'e> Factory<'e> {
             sequence.finish(outcome.estimate.sensor.view());
         }
         let new: Vec<&[Update]> = self.parts.iter().zip(done).map(|(part, done)| &part.updates()[done..]).collect();
-        let updates_of = self.parts.iter().zip(&new).filter(|(part, _)| part.is_network()).map(|(_, u)| u.len()).collect();
+        let updates_of =
+            self.parts.iter().zip(&new).filter(|(part, _)| part.is_network()).map(|(_, u)| u.len()).collect();
         let updates = new.concat();
         let adaptation = task.map(|task| Adaptation {
             relation: task.relation,
@@ -310,7 +311,8 @@ impl<'e> Factory<'e> {
     }
 
     fn has_network(&self) -> bool {
-        self.parts.iter().any(Part::is_network) || matches!(self.experiment.demosaicer, Some(DemosaicerChoice::Ddnet { .. }))
+        self.parts.iter().any(Part::is_network)
+            || matches!(self.experiment.demosaicer, Some(DemosaicerChoice::Ddnet { .. }))
     }
 
     /// The instruction set that runs: that of the networks' kernels, or of the solver where there is no network.

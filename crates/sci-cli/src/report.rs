@@ -59,10 +59,7 @@ fn for_html(json: &str) -> String {
     json.replace('<', "\\u003c")
 }
 
-fn write_page(
-    path: &Path,
-    data: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
-) -> Result<(), WriteError> {
+fn write_page(path: &Path, data: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>) -> Result<(), WriteError> {
     let [head, after_style, after_data, tail] = cut(TEMPLATE, ["{{style}}", "{{data}}", "{{script}}"]);
     write_atomically(path, |w| {
         w.write_all([head, STYLE, after_style].concat().as_bytes())?;

@@ -35,8 +35,7 @@ pub(super) struct Args {
 
 impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
-        let records =
-            self.runs.iter().map(|dir| Record::read(&dir.join(RECORD))).collect::<Result<Vec<_>, _>>()?;
+        let records = self.runs.iter().map(|dir| Record::read(&dir.join(RECORD))).collect::<Result<Vec<_>, _>>()?;
         print_table(&records);
         match (self.runs.as_slice(), records.as_slice()) {
             ([dir], [record]) => self.page_of_one(dir, record)?,
@@ -100,7 +99,9 @@ fn limit_of(record: &Record) -> u64 {
 /// The pictures of each measurement, from the result in the folder, and from the scene if it can still be read.
 fn make_pieces(dir: &Path, record: &Record, limit: usize, to: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let scene = scene_of(record)
-        .inspect_err(|e| eprintln!("warning: the scene cannot be read again, so the page shows the results alone: {e:#}"))
+        .inspect_err(|e| {
+            eprintln!("warning: the scene cannot be read again, so the page shows the results alone: {e:#}")
+        })
         .ok();
     let unit = scene.as_ref().map_or(1.0, |scene| scene.unit);
     let video = result(dir, record, unit)?;
@@ -124,7 +125,8 @@ fn make_pieces(dir: &Path, record: &Record, limit: usize, to: &Path) -> anyhow::
 }
 
 fn images<'a>(scene: Option<&'a Scene>, index: usize, recon: ArrayView4<'a, f32>) -> MeasurementImages<'a> {
-    let fits = |scene: &&Scene| index < scene.len() && scene.operator.shape().image_dim() == (recon.dim().2, recon.dim().3);
+    let fits =
+        |scene: &&Scene| index < scene.len() && scene.operator.shape().image_dim() == (recon.dim().2, recon.dim().3);
     let scene = scene.filter(fits);
     let truth = scene.and_then(|scene| match recon.len_of(Axis(1)) {
         3 => scene.rgb_of(index),
@@ -161,6 +163,10 @@ fn result(dir: &Path, record: &Record, unit: f32) -> anyhow::Result<Array4<f32>>
         return Ok(if unit == 1.0 { video } else { video / unit });
     }
     let frames = dir.join("frames");
-    anyhow::ensure!(frames.is_dir(), "{}: neither recon.npy, recon.npz, recon.mat nor frames to make a page of", dir.display());
+    anyhow::ensure!(
+        frames.is_dir(),
+        "{}: neither recon.npy, recon.npz, recon.mat nor frames to make a page of",
+        dir.display()
+    );
     Ok(scene::read_video(&frames, &Reading::default())?)
 }

@@ -72,13 +72,17 @@ impl Args {
             outln!("nothing is unfinished: {} holds the results of this run", out.display());
             return Ok(Done::Complete);
         };
-        self.announce(&experiment, &scene, chosen.len(), (&folder, &out));
+        self.announce(&experiment, &scene, chosen.len(), &folder, &out);
         let solved = solve(&experiment, &scene, &chosen, &mut factory, &mut folder);
         let stopped = folder.finished().iter().filter(|f| f.is_whole()).count();
         let run = results::Results { experiment: &experiment, scene: &scene, factory: &factory, out: &out, begin };
         let done = solved.and_then(|()| run.finish(folder, chosen.len()));
-        if done.is_err() && stopped > 0 && !out.join(crate::run_folder::RECORD).exists() {
-            eprintln!("{stopped} of {} measurements are kept in {}: add --resume to go on", chosen.len(), out.display());
+        if done.is_err() && stopped > 0 && RunFolder::is_stopped_in(&out) {
+            eprintln!(
+                "{stopped} of {} measurements are kept in {}: add --resume to go on",
+                chosen.len(),
+                out.display()
+            );
         }
         done
     }
@@ -91,7 +95,7 @@ impl Args {
         }
     }
 
-    fn announce(&self, experiment: &Experiment, scene: &Scene, count: usize, (folder, out): (&RunFolder, &Path)) {
+    fn announce(&self, experiment: &Experiment, scene: &Scene, count: usize, folder: &RunFolder, out: &Path) {
         let plural = if count == 1 { "" } else { "s" };
         outln!(
             "{} on {}: {} + {}, {count} measurement{plural} of {}",

@@ -374,7 +374,9 @@ impl Experiment {
             _ => None,
         };
         let networks = self.denoisers.iter().filter_map(|d| match d {
-            Denoiser::Ffdnet { weights, .. } | Denoiser::Fastdvdnet { weights, .. } => Some(("denoiser.weights", weights)),
+            Denoiser::Ffdnet { weights, .. } | Denoiser::Fastdvdnet { weights, .. } => {
+                Some(("denoiser.weights", weights))
+            }
             Denoiser::Tv { .. } | Denoiser::Wnnm(_) => None,
         });
         let all = [("data.path", &self.data.path)].into_iter().chain(mask).chain(demosaicer).chain(networks);

@@ -41,13 +41,8 @@ pub enum VideoFormat {
 
 impl VideoFormat {
     /// All of them, by their names in experiment files.
-    pub const ALL: [(&str, Self); 5] = [
-        ("npy", Self::Npy),
-        ("npz", Self::Npz),
-        ("mat", Self::Mat),
-        ("tiff", Self::Tiff),
-        ("tiff16", Self::Tiff16),
-    ];
+    pub const ALL: [(&str, Self); 5] =
+        [("npy", Self::Npy), ("npz", Self::Npz), ("mat", Self::Mat), ("tiff", Self::Tiff), ("tiff16", Self::Tiff16)];
 
     /// The file's name.
     pub fn file_name(self) -> &'static str {
@@ -107,7 +102,8 @@ impl Parts<'_> {
             }
             for _ in 0..frames {
                 file.read_exact(&mut bytes)?;
-                let samples: Vec<f32> = bytes.as_chunks().0.iter().map(|&b| f32::from_le_bytes(b) * self.unit).collect();
+                let samples: Vec<f32> =
+                    bytes.as_chunks().0.iter().map(|&b| f32::from_le_bytes(b) * self.unit).collect();
                 take(&samples)?;
             }
         }
@@ -269,7 +265,9 @@ mod tests {
     use ndarray_npy::WriteNpyExt;
 
     fn video(seed: usize, channels: usize) -> Array4<f32> {
-        Array4::from_shape_fn((2, channels, 3, 4), |(t, c, y, x)| ((seed + t * 24 + c * 7 + y * 4 + x) % 50) as f32 / 64.0)
+        Array4::from_shape_fn((2, channels, 3, 4), |(t, c, y, x)| {
+            ((seed + t * 24 + c * 7 + y * 4 + x) % 50) as f32 / 64.0
+        })
     }
 
     /// Two parts on disk, and the video they make.
@@ -308,8 +306,12 @@ mod tests {
             join(&to, format, &parts).unwrap();
             let mut tiff = tiff::decoder::Decoder::new(File::open(&to).unwrap()).unwrap();
             let description = tiff.get_tag_ascii_string(Tag::ImageDescription).unwrap();
-            assert!(description.starts_with("ImageJ=") && description.contains("channels=3\nframes=4\n"), "{description}");
-            let mut planes = expected.outer_iter().flat_map(|frame| frame.outer_iter().map(|p| p.to_owned()).collect::<Vec<_>>());
+            assert!(
+                description.starts_with("ImageJ=") && description.contains("channels=3\nframes=4\n"),
+                "{description}"
+            );
+            let mut planes =
+                expected.outer_iter().flat_map(|frame| frame.outer_iter().map(|p| p.to_owned()).collect::<Vec<_>>());
             loop {
                 let plane = planes.next().unwrap();
                 let found: Vec<f32> = match tiff.read_image().unwrap() {

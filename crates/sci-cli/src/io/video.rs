@@ -168,8 +168,7 @@ fn push_ycc(out: &mut Vec<u8>, [y, u, v]: [&[u8]; 3], space: y4m::Colorspace, (w
 pub fn write_gif(w: impl Write, video: ArrayView4<'_, f32>, fps: u16) -> Result<(), gif::EncodingError> {
     let (_, channels, height, width) = video.dim();
     let side = |n: usize| {
-        u16::try_from(n)
-            .map_err(|_| io::Error::new(io::ErrorKind::InvalidInput, "a GIF side is at most 65535 pixels"))
+        u16::try_from(n).map_err(|_| io::Error::new(io::ErrorKind::InvalidInput, "a GIF side is at most 65535 pixels"))
     };
     let (height, width) = (side(height)?, side(width)?);
     let ramp: Vec<u8> = (0..=255).flat_map(|g| [g; 3]).collect();
@@ -240,7 +239,8 @@ mod tests {
     fn joined_gifs_are_the_gif_of_the_joined_videos() {
         let dir = tempfile::tempdir().unwrap();
         for channels in [1, 3] {
-            let video = Array4::from_shape_fn((5, channels, 6, 7), |(t, c, y, x)| ((t * 31 + c * 5 + y * x) as f32) / 255.0);
+            let video =
+                Array4::from_shape_fn((5, channels, 6, 7), |(t, c, y, x)| ((t * 31 + c * 5 + y * x) as f32) / 255.0);
             let gif = |video: ArrayView4<'_, f32>| {
                 let mut bytes = Vec::new();
                 write_gif(&mut bytes, video, 10).unwrap();

@@ -65,8 +65,9 @@ impl Pictures {
         let truth = images.truth.map(encode).transpose()?;
         let measurement = images.measurement.map(|y| encode(to_its_largest(y).view())).transpose()?;
         let taken = measurement.iter().flatten().map(|png| uri_len(png)).sum::<usize>();
-        let of_frame: Vec<usize> =
-            (0..recon.len()).map(|t| uri_len(&recon[t]) + truth.as_ref().map_or(0, |truth| uri_len(&truth[t]))).collect();
+        let of_frame: Vec<usize> = (0..recon.len())
+            .map(|t| uri_len(&recon[t]) + truth.as_ref().map_or(0, |truth| uri_len(&truth[t])))
+            .collect();
         let step = step(&of_frame, limit.saturating_sub(taken));
         let shown = |pngs: Vec<Vec<u8>>| pngs.iter().step_by(step).map(|png| uri(png)).collect::<Vec<_>>();
         let psnr_db = images.truth.map_or_else(Vec::new, |truth| {

@@ -92,7 +92,9 @@ mod tests {
         for name in ["recon.npy", "recon.tif", "frames/m00_t00.png", "preview.gif", "adapted-0-ffdnet.safetensors"] {
             assert!(can_be_ours(name), "{name}");
         }
-        for name in ["", ".", "..", "../recon.npy", "/recon.npy", "frames", "frames/../x", "recon./x", "notes.txt", "a/b/c"] {
+        for name in
+            ["", ".", "..", "../recon.npy", "/recon.npy", "frames", "frames/../x", "recon./x", "notes.txt", "a/b/c"]
+        {
             assert!(!can_be_ours(name), "{name}");
         }
     }

@@ -27,7 +27,7 @@ pub use destination::refuse_inputs;
 pub use store::{Finished, read_video};
 
 use crate::io::output::{WriteError, write_atomically};
-use crate::record::Record;
+use crate::record::{Record, Stop};
 
 /// The file whose presence says that a folder holds the results of a run; it is moved into place last.
 pub const RECORD: &str = "record.json";
@@ -104,6 +104,11 @@ impl RunFolder {
         Ok(Some(folder))
     }
 
+    /// Whether a folder holds a run that can be resumed.
+    pub fn is_stopped_in(dir: &Path) -> bool {
+        dir.join(STAGING).join(RUN).exists()
+    }
+
     fn staging(&self) -> PathBuf {
         self.dir.join(STAGING)
     }
@@ -130,14 +135,15 @@ impl RunFolder {
             return Ok(false);
         }
         let record = Record::read(&record)?;
+        // It may have been stopped in its first measurement, of which nothing is left to go on from.
         let solved: Vec<usize> = record.measurements.iter().map(|m| m.index).collect();
+        let complete = solved == plan.measurements && record.measurements.iter().all(|m| m.stop != Stop::Observer);
         let mut config = record.config;
         config.as_object_mut().map(|config| config.remove("written"));
         let mut differences = Vec::new();
         compare("", &config, &through_text(&plan.identity["config"]), &mut differences);
-        compare("measurements", &Value::from(solved), &Value::from(plan.measurements.clone()), &mut differences);
         if differences.is_empty() {
-            return Ok(true);
+            return Ok(complete);
         }
         let problem = "nothing is unfinished there, and it holds the results of another run";
         Err(self.refuse_resume(problem, &differences).into())
@@ -155,7 +161,9 @@ impl RunFolder {
     fn begin(&mut self, plan: &RunPlan, wish: Wish) -> anyhow::Result<()> {
         let path = self.staging().join(RUN);
         let there = fs::read_to_string(&path).ok();
-        if wish == Wish::Resume && let Some(there) = &there {
+        if wish == Wish::Resume
+            && let Some(there) = &there
+        {
             let there: Value = serde_json::from_str(there).unwrap_or_default();
             let mut differences = Vec::new();
             compare("", &there, &through_text(&plan.identity), &mut differences);
@@ -305,7 +313,10 @@ fn lock(dir: &Path) -> anyhow::Result<File> {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => return Err(busy().into()),
         Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
-            eprintln!("warning: {}: the file system has no locks, so see to it that no other run is at work there", dir.display());
+            eprintln!(
+                "warning: {}: the file system has no locks, so see to it that no other run is at work there",
+                dir.display()
+            );
         }
         Err(TryLockError::Error(e)) => return Err(fail(&path)(e).into()),
     }

@@ -125,7 +125,7 @@ pub fn read_video(path: &Path) -> anyhow::Result<Array4<f32>> {
 }
 
 impl RunFolder {
-    /// Puts a solved measurement on disk. `sensor` is kept if a later measurement can need it; `state` writes the weights that
+    /// Puts a solved measurement on disk. What the sensor sees of it is kept if a later measurement can need it; `state` writes the weights that
     /// it needs into a folder. `whole` says that it was not stopped from outside: else [`RunFolder::finished`] does not know it
     /// after the run.
     ///
@@ -135,7 +135,8 @@ impl RunFolder {
         &mut self,
         record: MeasurementRecord,
         estimate: &Estimate,
-        (keep_sensor, whole): (bool, bool),
+        keep_sensor: bool,
+        whole: bool,
         state: impl FnOnce(&Path) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
         let dir = self.measurement(record.index);

@@ -21,7 +21,12 @@ use crate::run_folder::{Finished, RECORD, RunFolder};
 const REPORT: &str = "report.html";
 
 /// Every file of a run of these measurements, of `frames` frames each, but for the record.
-pub(super) fn files(experiment: &Experiment, factory: &Factory<'_>, frames: usize, measurements: &[usize]) -> Vec<String> {
+pub(super) fn files(
+    experiment: &Experiment,
+    factory: &Factory<'_>,
+    frames: usize,
+    measurements: &[usize],
+) -> Vec<String> {
     let output = &experiment.output;
     let mut files = vec![output.format.file_name().to_owned()];
     if output.frames {

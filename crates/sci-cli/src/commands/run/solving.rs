@@ -43,9 +43,10 @@ pub(super) fn solve_all(
         if record.stop == Stop::Diverged {
             eprintln!("{}", advice(&record, experiment));
         }
-        let keep = (factory.needs_previous(), record.stop != Stop::Observer);
-        let saves = factory.needs_weights();
-        folder.store(record, &estimate, keep, |dir| if saves { factory.save_weights(dir) } else { Ok(()) })?;
+        let (whole, saves) = (record.stop != Stop::Observer, factory.needs_weights());
+        folder.store(record, &estimate, factory.needs_previous(), whole, |dir| {
+            if saves { factory.save_weights(dir) } else { Ok(()) }
+        })?;
         previous = factory.needs_previous().then(|| estimate.sensor.clone());
         let finished = folder.finished().last().cloned().context("a measurement was stored")?;
         if !show(Job { finished, estimate, last: i + 1 == chosen.len() }) {
