@@ -185,9 +185,17 @@ fn networks_that_adapt_go_on_as_they_were() {
     // Some updates are kept and some rolled back, which lowers the learning rate for those that follow.
     let online = "[online]\nreuse = \"carry-over\"\ninterval = 2\nlearning_rate = 3e-3\nheld_out = 0.1\nsave = true\n";
     let config = CONFIG.replace("kind = \"tv\"", "kind = \"ffdnet\"\nweights = \"../net.safetensors\"");
-    let config = config.replace("iterations = 20", "iterations = 8\nsigma = 20").replace("start = \"previous\"\n", "");
+    let config = config.replace("iterations = 20", "iterations = 30\nsigma = 20").replace("start = \"previous\"\n", "");
     bench.write("here/a.toml", config + online);
-    kill_and_resume(&bench, &[], 4);
+    ok(&bench, &["--out", "whole"]);
+    for solved in ["m00", "m01", "m02"] {
+        let mut child = begin(&bench, &["--out", "killed", "--resume"]);
+        wait_for(&bench.path("killed/.sci-run").join(solved));
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+    assert!(ok(&bench, &["--out", "killed", "--resume"]).stdout.contains("going on: 3 of 4"));
+    assert_same(&bench.path("killed"), &bench.path("whole"));
     let record = bench.record("killed");
     let all = record["measurements"].as_array().unwrap();
     assert!(all.iter().any(|m| m["online"]["counts"]["rolled_back"].as_u64() > Some(0)), "nothing was rolled back");
