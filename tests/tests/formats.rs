@@ -135,13 +135,12 @@ fn every_output_reads_back_as_the_result() {
     let bench = bench();
     bench.write("clip.y4m", y4m());
     ok(&bench, &["simulate", "clip.y4m", "--frames", "4", "--out", "s.npz"]);
-    for format in ["npz", "mat", "npy"] {
+    for (format, result) in [("npz", "recon.npz"), ("mat", "recon.mat"), ("npy", "recon.npy"), ("tiff", "recon.tif")] {
         let set = format!("output.format={format}");
         ok(&bench, &["run", "a.toml", "--out", format, "--set", "data.path=s.npz", "--set", &set]);
         let mut names: Vec<_> = fs::read_dir(bench.path(format)).unwrap().map(|e| e.unwrap().file_name()).collect();
         names.sort();
-        let result = format!("recon.{format}");
-        assert_eq!(names, ["frames", "preview.gif", result.as_str(), "record.json", "report.html"]);
+        assert_eq!(names, ["frames", "preview.gif", result, "record.json", "report.html"]);
     }
     let truth = psnr(&bench, "npy/recon.npy", "clip.y4m");
     let recorded = bench.record("npy")["mean"]["psnr_db"].as_f64().unwrap();

@@ -160,6 +160,14 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         Ok(self.net.set_state(&WeightFile::read(path)?.into_tensors())?)
     }
 
+    /// Counts updates of the measurement begun last that were made before the program was stopped: they go into the record, and
+    /// the learning rate is what their roll-backs made of it. Their weights come by [`AdaptiveDenoiser::load`].
+    pub fn take_up(&mut self, updates: &[Update]) {
+        let undone = updates.iter().filter(|u| matches!(u.outcome, UpdateOutcome::RolledBack(_)));
+        undone.for_each(|_| self.rate *= self.config.roll_back.back_off);
+        self.updates.extend_from_slice(updates);
+    }
+
     fn due(&self, iteration: usize) -> bool {
         let of_sequence = self.since_reset.saturating_sub(1);
         self.measurements > 0 && self.config.schedule.due(iteration, of_sequence, self.fired)

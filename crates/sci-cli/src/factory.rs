@@ -10,9 +10,9 @@ use admm::{
 };
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayViewMut4};
-use nets::kernels::Precision;
+use nets::kernels::{Isa, Precision};
 use nets::{MixedPrecision, Network, PrecisionCounter, PrecisionCounts};
-use online::{AdaptiveDenoiser, Sequence, Task, Update, UpdateCounts};
+use online::{AdaptiveDenoiser, Reuse, Sequence, Task, Update, UpdateCounts};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer, Measurement};
 
@@ -50,6 +50,18 @@ enum Part {
 }
 
 impl Part {
+    fn is_network(&self) -> bool {
+        self.precision().is_some()
+    }
+
+    /// What it is to multiply, if it is a network.
+    fn precision(&self) -> Option<Precision> {
+        match self {
+            Self::Tv { .. } | Self::Wnnm(_) => None,
+            Self::Ffdnet(_, inference) | Self::Fastdvdnet(_, inference) => Some(inference.precision),
+        }
+    }
+
     fn prepare(&mut self, task: &Task) -> online::Result<()> {
         match self {
             Self::Tv { .. } | Self::Wnnm(_) => Ok(()),
@@ -74,6 +86,23 @@ impl Part {
             (Self::Tv { weight, inner }, Some(_)) => Box::new(PerLattice::new(Tv::new(*weight).inner(*inner))),
             (part, Some(s)) => Box::new(Demosaicked::new(part.on_frames(saving), s.demosaicer.clone(), s.cfa)),
             (part, None) => Box::new(part.on_frames(saving)),
+        }
+    }
+
+    fn load(&mut self, path: &Path) -> online::Result<()> {
+        match self {
+            Self::Tv { .. } | Self::Wnnm(_) => Ok(()),
+            Self::Ffdnet(net, _) => net.load(path),
+            Self::Fastdvdnet(net, _) => net.load(path),
+        }
+    }
+
+    /// Of the updates of all networks, which the record joins, those of the denoiser that this is.
+    fn take_up(&mut self, updates: &[Update]) {
+        match self {
+            Self::Tv { .. } | Self::Wnnm(_) => {}
+            Self::Ffdnet(net, _) => net.take_up(updates),
+            Self::Fastdvdnet(net, _) => net.take_up(updates),
         }
     }
 
@@ -153,14 +182,17 @@ impl<'e> Factory<'e> {
         if let Some(sequence) = &mut self.sequence {
             sequence.finish(outcome.estimate.sensor.view());
         }
-        let new = self.parts.iter().zip(done).flat_map(|(part, done)| &part.updates()[done..]);
-        let updates: Vec<Update> = new.copied().collect();
+        let new: Vec<&[Update]> = self.parts.iter().zip(done).map(|(part, done)| &part.updates()[done..]).collect();
+        let updates_of =
+            self.parts.iter().zip(&new).filter(|(part, _)| part.is_network()).map(|(_, u)| u.len()).collect();
+        let updates = new.concat();
         let adaptation = task.map(|task| Adaptation {
             relation: task.relation,
             warm_start: task.is_warm(),
             cut: task.cut,
             counts: UpdateCounts::of(&updates),
             updates,
+            updates_of,
         });
         Ok(Solved { outcome, planned: plan.iterations(), work, adaptation })
     }
@@ -200,21 +232,115 @@ impl<'e> Factory<'e> {
         Ok((outcome, saving.work()))
     }
 
-    /// Writes the weights as they are now, of each network one file `adapted-N-KIND.safetensors`, N its place among the
-    /// denoisers.
+    /// Whether a measurement can need what the sensor sees of the one before.
+    pub fn needs_previous(&self) -> bool {
+        self.experiment.start == StartChoice::Previous || self.carries_over()
+    }
+
+    /// Whether networks go from measurement to measurement as they are.
+    fn carries_over(&self) -> bool {
+        self.experiment.online.is_some_and(|o| o.sequence.reuse == Reuse::CarryOver)
+    }
+
+    /// Whether weights are to be kept with each measurement: for the next one, or to be saved with the last.
+    pub fn needs_weights(&self) -> bool {
+        self.carries_over() || self.experiment.online.is_some_and(|o| o.save)
+    }
+
+    /// The file of each adapting network's weights, `adapted-N-KIND.safetensors`, N its place among the denoisers.
+    pub fn weight_files(&self) -> Vec<String> {
+        let networks = self.experiment.denoisers.iter().enumerate().filter(|(_, d)| d.is_network());
+        networks.map(|(i, d)| format!("adapted-{i}-{}.safetensors", d.kind())).collect()
+    }
+
+    fn networks(&mut self) -> impl Iterator<Item = (&mut Part, String)> {
+        let names = self.weight_files();
+        self.parts.iter_mut().filter(|part| part.is_network()).zip(names)
+    }
+
+    /// Writes the weights as they are now to [`Factory::weight_files`] in a folder.
     ///
     /// # Errors
     /// When a file cannot be written.
-    pub fn save_adapted(&self, dir: &Path) -> anyhow::Result<()> {
-        for (i, (part, choice)) in self.parts.iter().zip(&self.experiment.denoisers).enumerate() {
-            let path = dir.join(format!("adapted-{i}-{}.safetensors", choice.kind()));
+    pub fn save_weights(&mut self, dir: &Path) -> anyhow::Result<()> {
+        for (part, name) in self.networks() {
             match part {
                 Part::Tv { .. } | Part::Wnnm(_) => {}
-                Part::Ffdnet(net, _) => net.save(&path)?,
-                Part::Fastdvdnet(net, _) => net.save(&path)?,
+                Part::Ffdnet(net, _) => net.save(&dir.join(name))?,
+                Part::Fastdvdnet(net, _) => net.save(&dir.join(name))?,
             }
         }
         Ok(())
+    }
+
+    /// Takes a measurement as solved that was before the program was stopped: `sensor` is what [`Factory::solve`] made of it, if
+    /// it was kept, `updates` its updates, each as long as the network was that made it.
+    ///
+    /// # Errors
+    /// None that is known for measurements that have been solved before.
+    pub fn pass(
+        &mut self,
+        scene: &Scene,
+        k: usize,
+        sensor: Option<ArrayView3<'_, f32>>,
+        adaptation: Option<&Adaptation>,
+    ) -> anyhow::Result<()> {
+        self.begin(&scene.measurement(k)?)?;
+        if let (Some(sequence), Some(sensor)) = (&mut self.sequence, sensor) {
+            sequence.finish(sensor);
+        }
+        let mut updates = adaptation.map_or(&[][..], |a| &a.updates);
+        let counts = adaptation.map_or(&[][..], |a| &a.updates_of);
+        for ((part, _), &count) in self.networks().zip(counts) {
+            let (own, rest) = updates.split_at_checked(count).unwrap_or((updates, &[]));
+            part.take_up(own);
+            updates = rest;
+        }
+        Ok(())
+    }
+
+    /// Reads what [`Factory::save_weights`] wrote, if networks go from measurement to measurement as they are.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn load_weights(&mut self, dir: &Path) -> anyhow::Result<()> {
+        if !self.carries_over() {
+            return Ok(());
+        }
+        self.networks().try_for_each(|(part, name)| Ok(part.load(&dir.join(name))?))
+    }
+
+    fn has_network(&self) -> bool {
+        self.parts.iter().any(Part::is_network)
+            || matches!(self.experiment.demosaicer, Some(DemosaicerChoice::Ddnet { .. }))
+    }
+
+    /// The instruction set that runs: that of the networks' kernels, or of the solver where there is no network.
+    ///
+    /// # Errors
+    /// When `SCI_KERNEL` names none that this machine has, and there is a network to run on it.
+    pub fn kernel(&self) -> anyhow::Result<&'static str> {
+        if self.has_network() {
+            return Ok(Isa::detect()?.name());
+        }
+        // Solvers choose by themselves, and the matrix unit is not for them.
+        let own = Isa::ALL.into_iter().filter(|isa| *isa != Isa::Amx).find(|isa| isa.available());
+        Ok(own.unwrap_or(Isa::Portable).name())
+    }
+
+    /// What networks multiply: bf16 is for the matrix unit only; `halved` is the share that `[skip]` chose it for.
+    ///
+    /// # Errors
+    /// As [`Factory::kernel`].
+    pub fn precision_used(&self, halved: f64) -> anyhow::Result<&'static str> {
+        let wished = self.parts.iter().any(|part| part.precision() == Some(Precision::Bf16));
+        let has_unit = self.has_network() && Isa::detect()? == Isa::Amx;
+        let full = self.parts.iter().any(|part| part.precision() == Some(Precision::F32));
+        Ok(match (has_unit && wished, has_unit && halved > 0.0) {
+            (true, false) if !full => "bf16",
+            (false, false) => "f32",
+            _ => "mixed",
+        })
     }
 }
 

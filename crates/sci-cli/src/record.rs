@@ -42,7 +42,21 @@ pub struct Record {
     pub revision: String,
     /// The processor's name.
     pub cpu: String,
-    /// The resolved experiment: paths absolute, defaults filled in.
+    /// The instruction set that ran: that of the networks' kernels, or of the solver where there is no network.
+    #[serde(default)]
+    pub kernel: String,
+    /// What networks multiplied: `f32`, `bf16`, or `mixed` where `[skip]` chose; a wish for bf16 that the processor cannot
+    /// fulfil is `f32`.
+    #[serde(default)]
+    pub precision_used: String,
+    /// Wall-clock seconds of the command up to this record; of one that resumed a run, its own.
+    #[serde(default)]
+    pub wall_seconds: f64,
+    /// Every other file of the run, relative to the record's folder. A later run may replace and remove these and no others.
+    #[serde(default)]
+    pub files: Vec<String>,
+    /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text` and
+    /// the `--set`s.
     pub config: serde_json::Value,
 }
 
@@ -109,8 +123,11 @@ pub struct Adaptation {
     pub cut: bool,
     /// How many updates of which kind.
     pub counts: UpdateCounts,
-    /// Every update that was due, in order.
+    /// Every update that was due, in order; those of the first network first.
     pub updates: Vec<Update>,
+    /// How many of them are of which network.
+    #[serde(default)]
+    pub updates_of: Vec<usize>,
 }
 
 /// Why a solve ended; the same reasons as [`admm::StopReason`].
@@ -280,7 +297,8 @@ pub(crate) mod tests {
       "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },
       "trace": { "psnr_db": [], "relative_residual": [], "relative_change": [], "seconds": [] } } ],
   "mean": { "psnr_db": 20.76, "ssim": 0.687, "seconds": 0.05, "iterations": 40.0 },
-  "peak_rss_bytes": 0, "threads": 2, "seed": 0, "version": "", "revision": "", "cpu": "", "config": { } }"#;
+  "peak_rss_bytes": 0, "threads": 2, "seed": 0, "version": "", "revision": "", "cpu": "",
+  "kernel": "avx2", "precision_used": "f32", "wall_seconds": 0.5, "files": ["recon.npy"], "config": { } }"#;
 
     #[test]
     fn names_are_those_of_the_format() {

@@ -26,6 +26,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 
 use crate::config::ConfigError;
+use crate::run_folder::Refusal;
 
 /// Reconstruct video from snapshot compressive measurements.
 #[derive(Debug, Parser)]
@@ -79,7 +80,7 @@ impl Cli {
             Ok(Done::Interrupted) => ExitCode::from(130),
             Err(error) => {
                 eprintln!("error: {}", chain(&error));
-                let usage = error.is::<ConfigError>() || error.is::<UsageError>();
+                let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<Refusal>();
                 ExitCode::from(if usage { 2 } else { 1 })
             }
         }

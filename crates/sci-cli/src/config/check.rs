@@ -12,6 +12,7 @@ use super::file::*;
 use super::skipping::{AUTO, Skip};
 use super::source::{ConfigError, Source};
 use crate::io::defects::Defects;
+use crate::io::recon::VideoFormat;
 use crate::io::scene::{Axes, Keys, Reading};
 
 /// A path as written, with what is needed to look it up and to report it.
@@ -161,28 +162,21 @@ pub struct Stage {
     pub denoiser: usize,
 }
 
-/// The format of the reconstruction.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum OutputFormat {
-    /// `recon.npy`.
-    Npy,
-    /// `recon.npz`.
-    Npz,
-    /// `recon.mat`, v5.
-    Mat,
-}
-
-/// `[output]`.
+/// `[output]`, or `output = "minimal"`: nothing but the reconstruction and the record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Output {
     /// Format of the reconstruction.
-    pub format: OutputFormat,
+    pub format: VideoFormat,
     /// Write PNG frames.
     pub frames: bool,
     /// Write an animated GIF.
     pub preview: bool,
     /// Its frames a second.
     pub fps: u16,
+    /// Write the page.
+    pub report: bool,
+    /// What its pictures may take, in units of a million bytes.
+    pub report_megabytes: u32,
 }
 
 /// An experiment whose every value is legal; paths are not looked up yet.
@@ -261,6 +255,7 @@ impl<'s> Checker<'s> {
         let named = root.take("schedules")?;
         let stop = root.take("stop")?;
         let (skip, online) = (root.take("skip")?, root.take("online")?);
+        let minimal = root.take_word("output", "minimal");
         let output = root.take("output")?;
         let top: TopKeys = root.read(&[])?;
         let seed = self.whole("seed", &top.seed, SEEDS)?.unwrap_or(0) as u64;
@@ -275,7 +270,7 @@ impl<'s> Checker<'s> {
         let online = self.online(online, seed, &denoisers)?;
         let (relative_change, seconds) = self.stop(stop)?;
         let name = self.name(top.name)?;
-        let output = self.output(output)?;
+        let output = self.output(minimal, output)?;
         Ok(Checked {
             name,
             seed,
@@ -614,14 +609,16 @@ impl<'s> Checker<'s> {
         ))
     }
 
-    fn output(&self, section: Option<Section<'s>>) -> Result<Output, ConfigError> {
+    fn output(&self, minimal: bool, section: Option<Section<'s>>) -> Result<Output, ConfigError> {
         let k: OutputKeys = section.map(|s| s.read(&[])).transpose()?.unwrap_or_default();
-        let formats = [("npy", OutputFormat::Npy), ("npz", OutputFormat::Npz), ("mat", OutputFormat::Mat)];
+        let flag = |key: &str, value: &Value| Ok(self.flag(&format!("output.{key}"), value)?.unwrap_or(!minimal));
         Ok(Output {
-            format: self.choice("output.format", &k.format, &formats)?.unwrap_or(OutputFormat::Npy),
-            frames: self.flag("output.frames", &k.frames)?.unwrap_or(true),
-            preview: self.flag("output.preview", &k.preview)?.unwrap_or(true),
+            format: self.choice("output.format", &k.format, &VideoFormat::ALL)?.unwrap_or(VideoFormat::Npy),
+            frames: flag("frames", &k.frames)?,
+            preview: flag("preview", &k.preview)?,
             fps: self.whole("output.fps", &k.fps, 1..=50)?.unwrap_or(10) as u16,
+            report: flag("report", &k.report)?,
+            report_megabytes: self.whole("output.report_megabytes", &k.report_megabytes, 1..=400)?.unwrap_or(30) as u32,
         })
     }
 

@@ -228,6 +228,8 @@ pub struct OutputKeys {
     pub frames: Value,
     pub preview: Value,
     pub fps: Value,
+    pub report: Value,
+    pub report_megabytes: Value,
 }
 
 /// A table on its way to a struct: its dotted key, its span, and what has not been taken out of it yet.
@@ -262,6 +264,15 @@ impl<'s> Section<'s> {
     pub fn take(&mut self, key: &str) -> Result<Option<Section<'s>>, ConfigError> {
         let Some((_, value)) = self.table.remove_entry(key) else { return Ok(None) };
         self.section(self.key_of(key), value).map(Some)
+    }
+
+    /// Takes out a key that holds the given word where there could be a table; whether it did.
+    pub fn take_word(&mut self, key: &str, word: &str) -> bool {
+        let found = self.table.get(key).is_some_and(|value| value.get_ref().as_str() == Some(word));
+        if found {
+            self.table.remove(key);
+        }
+        found
     }
 
     /// Takes out a list of tables.

@@ -15,7 +15,7 @@ use crate::io::defects::Defects;
 use crate::io::scene::{Axes, Reading};
 
 pub use super::adaptation::Online;
-pub use super::check::{Demosaicer, Output, OutputFormat, RandomMask, Solver, Start};
+pub use super::check::{Demosaicer, Output, RandomMask, Solver, Start};
 
 /// The environment variable that names a folder of scenes and weights.
 pub const DATA_VARIABLE: &str = "SCI_DATA";
@@ -146,6 +146,19 @@ pub struct Experiment {
     pub online: Option<Online>,
     /// What to write.
     pub output: Output,
+    /// What it was read from.
+    pub written: Written,
+}
+
+/// An experiment as it was written, so that a record can be run again.
+#[derive(Clone, Debug)]
+pub struct Written {
+    /// The file, absolute.
+    pub file: PathBuf,
+    /// Its text.
+    pub text: String,
+    /// The `--set` arguments.
+    pub set: Vec<String>,
 }
 
 /// Reads, checks and resolves an experiment file with `--set` arguments applied.
@@ -159,12 +172,21 @@ pub fn load(path: &Path, arguments: &[String]) -> Result<Experiment, ConfigError
     })?;
     let text = String::from_utf8(bytes)
         .map_err(|_| ConfigError { place: Place::File(path.to_owned()), problem: "not a text file".into() })?;
-    let source = Source::new(path, &text, arguments);
-    let checked = check::check(&source)?;
-    resolve(checked, &source)
+    load_text(path, text, arguments)
 }
 
-fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError> {
+/// The same with the text of the file at hand; `path` is where it was.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_text(path: &Path, text: String, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    let source = Source::new(path, &text, arguments);
+    let checked = check::check(&source)?;
+    let file = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    resolve(checked, &source, Written { file, text: text.clone(), set: arguments.to_vec() })
+}
+
+fn resolve(checked: Checked, source: &Source, written: Written) -> Result<Experiment, ConfigError> {
     let find = |setting: &PathSetting| locate(setting, source);
     let simulate = match &checked.data.simulate {
         None => None,
@@ -231,6 +253,7 @@ fn resolve(checked: Checked, source: &Source) -> Result<Experiment, ConfigError>
         skip: checked.skip,
         online: checked.online,
         output: checked.output,
+        written,
     };
     cheap_first(&mut experiment);
     Ok(experiment)
@@ -340,6 +363,36 @@ impl Experiment {
         kinds.join(" → ")
     }
 
+    /// Every file and folder it reads, with its key.
+    pub fn inputs(&self) -> Vec<(&'static str, &Path)> {
+        let mask = match &self.data.simulate {
+            Some(Simulate { mask: MaskSource::File(path), .. }) => Some(("data.mask.path", path)),
+            _ => None,
+        };
+        let demosaicer = match &self.demosaicer {
+            Some(Demosaicer::Ddnet { weights }) => Some(("solver.weights", weights)),
+            _ => None,
+        };
+        let networks = self.denoisers.iter().filter_map(|d| match d {
+            Denoiser::Ffdnet { weights, .. } | Denoiser::Fastdvdnet { weights, .. } => {
+                Some(("denoiser.weights", weights))
+            }
+            Denoiser::Tv { .. } | Denoiser::Wnnm(_) => None,
+        });
+        let all = [("data.path", &self.data.path)].into_iter().chain(mask).chain(demosaicer).chain(networks);
+        all.filter(|(_, path)| !path.to_string_lossy().starts_with("bundled:"))
+            .map(|(key, path)| (key, path.as_path()))
+            .collect()
+    }
+
+    /// [`Experiment::to_json`] and what it was read from, so that it can be run again.
+    pub fn record_json(&self) -> Value {
+        let Written { file, text, set } = &self.written;
+        let mut value = self.to_json();
+        value["written"] = json!({ "file": file.to_string_lossy(), "text": text, "set": set });
+        value
+    }
+
     /// The resolved experiment for the run record, with the keys of the TOML; σ in `[0, 1]`, paths absolute.
     pub fn to_json(&self) -> Value {
         json!({
@@ -355,8 +408,8 @@ impl Experiment {
             "skip": self.skip.as_ref().map_or_else(|| json!({ "enabled": false }), skip_json),
             "online": self.online.as_ref().map_or_else(|| json!({ "enabled": false }), online_json),
             "output": {
-                "format": match self.output.format { OutputFormat::Npy => "npy", OutputFormat::Npz => "npz", OutputFormat::Mat => "mat" },
-                "frames": self.output.frames, "preview": self.output.preview, "fps": self.output.fps,
+                "format": self.output.format, "frames": self.output.frames, "preview": self.output.preview,
+                "fps": self.output.fps, "report": self.output.report, "report_megabytes": self.output.report_megabytes,
             },
         })
     }
@@ -366,7 +419,7 @@ impl Experiment {
         let axes = d.reading.axes.map(|a| if a == Axes::Hwt { "hwt" } else { "thw" });
         let mut value = json!({
             "kind": if d.simulate.is_some() { "simulate" } else { "scene" },
-            "path": d.path,
+            "path": d.path.to_string_lossy(),
             "measurements": d.measurements,
             "keys": { "mask": k.mask, "meas": k.meas, "orig": k.orig, "rgb": k.rgb },
             "axes": axes,
@@ -379,7 +432,7 @@ impl Experiment {
             value["mask"] = match &s.mask {
                 MaskSource::Random(r) => random("random", r),
                 MaskSource::Shifting(r) => random("shifting", r),
-                MaskSource::File(path) => json!({ "kind": "file", "path": path }),
+                MaskSource::File(path) => json!({ "kind": "file", "path": path.to_string_lossy() }),
             };
             value["noise"] = json!({ "sigma": s.sigma, "photons": s.photons, "seed": s.seed });
         }
@@ -410,7 +463,7 @@ impl Experiment {
             (None, _) => {}
         }
         if let Some(Demosaicer::Ddnet { weights }) = &self.demosaicer {
-            value["weights"] = json!(weights);
+            value["weights"] = json!(weights.to_string_lossy());
         }
         value["start"] = match self.start {
             Start::Mean => "mean".into(),
@@ -466,10 +519,10 @@ fn denoiser_json(d: &Denoiser) -> Value {
             json!({ "kind": "wnnm", "patch": patch, "group": group, "step": step, "window": window, "frames": frames })
         }
         Denoiser::Ffdnet { weights, inference: Inference { precision, flips } } => {
-            json!({ "kind": "ffdnet", "weights": weights, "precision": precision, "flips": flips })
+            json!({ "kind": "ffdnet", "weights": weights.to_string_lossy(), "precision": precision, "flips": flips })
         }
         Denoiser::Fastdvdnet { weights, ends, inference: Inference { precision, flips } } => {
-            json!({ "kind": "fastdvdnet", "weights": weights, "ends": ends, "precision": precision, "flips": flips })
+            json!({ "kind": "fastdvdnet", "weights": weights.to_string_lossy(), "ends": ends, "precision": precision, "flips": flips })
         }
     }
 }

@@ -4,9 +4,10 @@ use std::fs;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use image::codecs::{jpeg::JpegDecoder, png::PngDecoder};
-use image::{DynamicImage, ImageBuffer, ImageDecoder, Limits, Luma, Rgb};
-use ndarray::ArrayView3;
+use image::codecs::jpeg::JpegDecoder;
+use image::codecs::png::{CompressionType, FilterType, PngDecoder, PngEncoder};
+use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageResult, Limits};
+use ndarray::{Array3, ArrayView3};
 
 use super::samples::{Array, Budget, SampleType, Samples};
 use super::{FileError, Format, ReadError, read_file};
@@ -150,24 +151,48 @@ pub fn to_byte(x: f32) -> u8 {
     (x.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// Writes one frame `[C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as an 8-bit PNG.
+/// One frame `[C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as the bytes of an 8-bit PNG, compressed fast rather than well.
 ///
 /// # Errors
-/// The encoder's or the file's error.
-pub fn write_png(path: &Path, frame: ArrayView3<'_, f32>) -> image::ImageResult<()> {
-    let (c, h, w) = frame.dim();
-    let at = |c, x: u32, y: u32| to_byte(frame[[c, y as usize, x as usize]]);
-    if c == 1 {
-        ImageBuffer::from_fn(w as u32, h as u32, |x, y| Luma([at(0, x, y)])).save(path)
-    } else {
-        ImageBuffer::from_fn(w as u32, h as u32, |x, y| Rgb([at(0, x, y), at(1, x, y), at(2, x, y)])).save(path)
-    }
+/// The encoder's, for a frame without pixels.
+pub fn png(frame: ArrayView3<'_, f32>) -> ImageResult<Vec<u8>> {
+    let (channels, height, width) = frame.dim();
+    let pixels: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&v| to_byte(v)).collect();
+    let color = if channels == 1 { ExtendedColorType::L8 } else { ExtendedColorType::Rgb8 };
+    let mut bytes = Vec::new();
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive).write_image(
+        &pixels,
+        width as u32,
+        height as u32,
+        color,
+    )?;
+    Ok(bytes)
+}
+
+/// Half the height and width of a frame `[C, H, W]`, each pixel the mean of four; an odd last row or column is left out.
+pub fn halved(frame: ArrayView3<'_, f32>) -> Array3<f32> {
+    let (channels, height, width) = frame.dim();
+    Array3::from_shape_fn((channels, (height / 2).max(1), (width / 2).max(1)), |(c, y, x)| {
+        let at = |dy: usize, dx: usize| frame[[c, (2 * y + dy).min(height - 1), (2 * x + dx).min(width - 1)]];
+        0.25 * (at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1))
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array3;
+    use image::{ImageBuffer, Luma};
+
+    fn write_png(path: &Path, frame: ArrayView3<'_, f32>) -> ImageResult<()> {
+        Ok(fs::write(path, png(frame)?)?)
+    }
+
+    #[test]
+    fn half_a_frame_is_the_mean_of_four_pixels() {
+        let frame = Array3::from_shape_fn((1, 3, 4), |(_, y, x)| (4 * y + x) as f32);
+        assert_eq!(halved(frame.view()), ndarray::arr3(&[[[2.5, 4.5]]]));
+        assert_eq!(halved(ndarray::arr3(&[[[3.0]]]).view()), ndarray::arr3(&[[[3.0]]]));
+    }
 
     #[test]
     fn folder_round_trip_in_natural_order() {

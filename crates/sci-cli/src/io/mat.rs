@@ -323,42 +323,65 @@ pub struct Variable<'a> {
 /// The writer's error, or `InvalidInput` if a variable is larger than the 4 GiB the format can hold or its size does
 /// not match its data.
 pub fn write_v5(w: &mut impl Write, variables: &[Variable<'_>]) -> io::Result<()> {
+    write_file_header(w)?;
+    for v in variables {
+        if element_count(v.size) != Some(v.data.len()) {
+            return Err(invalid(v.name, "its size does not match its data"));
+        }
+        write_variable_header(w, v.name, v.size)?;
+        v.data.iter().try_for_each(|x| w.write_all(&x.to_le_bytes()))?;
+        w.write_all(padding(4 * v.data.len()))?;
+    }
+    Ok(())
+}
+
+/// Begins a v5 file.
+///
+/// # Errors
+/// The writer's error.
+pub fn write_file_header(w: &mut impl Write) -> io::Result<()> {
     let mut header = [b' '; HEADER_LEN];
     let text = b"MATLAB 5.0 MAT-file, written by sci";
     header[..text.len()].copy_from_slice(text);
     header[116..124].fill(0);
     header[124..128].copy_from_slice(b"\x00\x01IM");
-    w.write_all(&header)?;
-    for v in variables {
-        write_variable(w, v)?;
-    }
-    Ok(())
+    w.write_all(&header)
 }
 
-fn write_variable(w: &mut impl Write, v: &Variable<'_>) -> io::Result<()> {
-    let invalid = |reason: &str| io::Error::new(io::ErrorKind::InvalidInput, format!("`{}`: {reason}", v.name));
-    if element_count(v.size) != Some(v.data.len()) {
-        return Err(invalid("its size does not match its data"));
-    }
-    let words: Option<Vec<u32>> = v.size.iter().map(|&d| i32::try_from(d).ok().map(|d| d as u32)).collect();
-    let dims = words.ok_or_else(|| invalid("an axis is too long for a .mat v5 file"))?;
+/// Begins a variable of single precision; its samples in column-major order, little-endian, and their [`padding`] have to follow.
+///
+/// # Errors
+/// The writer's error, or `InvalidInput` if the variable is larger than the 4 GiB the format can hold.
+pub fn write_variable_header(w: &mut impl Write, name: &str, size: &[usize]) -> io::Result<()> {
+    let words: Option<Vec<u32>> = size.iter().map(|&d| i32::try_from(d).ok().map(|d| d as u32)).collect();
+    let dims = words.ok_or_else(|| invalid(name, "an axis is too long for a .mat v5 file"))?;
     let padded = |n: usize| n.next_multiple_of(8);
-    let data_len = v.data.len() * 4;
-    let body = 16 + 8 + padded(4 * dims.len()) + 8 + padded(v.name.len()) + 8 + padded(data_len);
-    let body = u32::try_from(body).map_err(|_| invalid("more than the 4 GiB a .mat v5 variable holds; use npy"))?;
+    let too_large = || invalid(name, "more than the 4 GiB a .mat v5 variable holds; use npy");
+    let data_len = element_count(size).and_then(|n| n.checked_mul(4)).ok_or_else(too_large)?;
+    let body = 16 + 8 + padded(4 * dims.len()) + 8 + padded(name.len()) + 8 + padded(data_len);
+    let body = u32::try_from(body).map_err(|_| too_large())?;
     let put = |w: &mut dyn Write, kind: u32, bytes: &[u8]| -> io::Result<()> {
         w.write_all(&kind.to_le_bytes())?;
         w.write_all(&(bytes.len() as u32).to_le_bytes())?;
         w.write_all(bytes)?;
-        w.write_all(&[0; 8][..padded(bytes.len()) - bytes.len()])
+        w.write_all(padding(bytes.len()))
     };
     w.write_all(&MI_MATRIX.to_le_bytes())?;
     w.write_all(&body.to_le_bytes())?;
     put(w, MI_UINT32, &[MX_SINGLE.to_le_bytes(), [0; 4]].concat())?;
     put(w, MI_INT32, &dims.iter().flat_map(|d| d.to_le_bytes()).collect::<Vec<_>>())?;
-    put(w, MI_INT8, v.name.as_bytes())?;
-    let data: Vec<u8> = v.data.iter().flat_map(|x| x.to_le_bytes()).collect();
-    put(w, MI_SINGLE, &data)
+    put(w, MI_INT8, name.as_bytes())?;
+    w.write_all(&MI_SINGLE.to_le_bytes())?;
+    w.write_all(&(data_len as u32).to_le_bytes())
+}
+
+/// The zeros after `len` bytes of data.
+pub fn padding(len: usize) -> &'static [u8] {
+    &[0; 8][..len.next_multiple_of(8) - len]
+}
+
+fn invalid(name: &str, reason: &str) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidInput, format!("`{name}`: {reason}"))
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@ pub mod frames;
 pub mod mat;
 pub mod npy;
 pub mod output;
+pub mod recon;
 pub mod samples;
 pub mod scene;
 pub mod video;

@@ -199,6 +199,19 @@ where
     array.write_npy(w)
 }
 
+/// What an `.npy` file of f32 in row-major order has before its samples.
+pub fn header(shape: &[usize]) -> Vec<u8> {
+    let lengths: Vec<String> = shape.iter().map(usize::to_string).collect();
+    let comma = if shape.len() == 1 { "," } else { "" };
+    let text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}{comma})}}", lengths.join(", "));
+    // Magic, version and length take 10 bytes, a line feed one; all together a multiple of 64.
+    let len = (10 + text.len() + 1).next_multiple_of(64) - 10;
+    let mut bytes = [MAGIC, &[1, 0], &(len as u16).to_le_bytes(), text.as_bytes()].concat();
+    bytes.resize(10 + len - 1, b' ');
+    bytes.push(b'\n');
+    bytes
+}
+
 /// Writes named arrays as a compressed `.npz`.
 ///
 /// # Errors
@@ -219,6 +232,16 @@ mod tests {
 
     fn ramp() -> Array3<f32> {
         Array3::from_shape_fn((2, 3, 4), |(t, y, x)| (100 * t + 10 * y + x) as f32)
+    }
+
+    #[test]
+    fn the_header_is_the_one_that_arrays_are_written_with() {
+        for shape in [vec![3], vec![2, 3], vec![1, 3, 10, 2], vec![1000, 3, 1, 1]] {
+            let mut bytes = Vec::new();
+            write_npy(&mut bytes, &ndarray::ArrayD::<f32>::zeros(shape.clone())).unwrap();
+            assert!(bytes.starts_with(&header(&shape)), "{shape:?}");
+            assert_eq!(bytes.len() - header(&shape).len(), 4 * shape.iter().product::<usize>());
+        }
     }
 
     #[test]

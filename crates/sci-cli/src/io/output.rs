@@ -1,4 +1,4 @@
-//! Owns what a run leaves on disk: written aside, then moved into place, so that no folder is ever half-written.
+//! Owns single files on their way to disk: written aside, then moved into place, so that none is ever half-written.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayView4, Axis};
 
 use super::mat::{Variable, write_v5};
-use super::{frames, npy, video};
+use super::npy;
 
 /// Full scale of the samples in `.mat` files.
-const MAT_SCALE: f32 = 255.0;
+pub(super) const MAT_SCALE: f32 = 255.0;
 
 /// Why a result cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -26,75 +26,6 @@ impl WriteError {
     /// Names the file an error belongs to.
     pub fn new(path: &Path, source: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
         Self { path: path.to_owned(), source: source.into() }
-    }
-}
-
-/// A folder being prepared beside its destination; dropped without [`Staging::commit`], it leaves nothing.
-#[derive(Debug)]
-pub struct Staging {
-    temporary: tempfile::TempDir,
-    destination: PathBuf,
-}
-
-/// The file whose presence says that a folder holds a finished run; it is moved into place last.
-pub const RECORD: &str = "record.json";
-
-impl Staging {
-    /// Prepares to fill `destination`, creating its parents.
-    ///
-    /// # Errors
-    /// If the parents cannot be created or written to, or the destination is a file.
-    pub fn new(destination: &Path) -> Result<Self, WriteError> {
-        let fail = |e: io::Error| WriteError::new(destination, e);
-        if destination.exists() && !destination.is_dir() {
-            return Err(fail(io::Error::new(io::ErrorKind::NotADirectory, "it is a file, not a folder")));
-        }
-        let absolute = std::path::absolute(destination).map_err(fail)?;
-        let parent = absolute.parent().unwrap_or(&absolute).to_owned();
-        fs::create_dir_all(&parent).map_err(fail)?;
-        let temporary = tempfile::Builder::new().prefix(".sci-").suffix(".tmp").tempdir_in(parent).map_err(fail)?;
-        Ok(Self { temporary, destination: absolute })
-    }
-
-    /// Where to write.
-    pub fn path(&self) -> &Path {
-        self.temporary.path()
-    }
-
-    /// Moves every entry into the destination, replacing those of the same name and leaving others alone.
-    ///
-    /// An old record is removed first and the new one put in last: a folder with a record is complete.
-    ///
-    /// # Errors
-    /// The file system's, naming the entry.
-    pub fn commit(self) -> Result<(), WriteError> {
-        let fail = |path: &Path| {
-            let path = path.to_owned();
-            move |e: io::Error| WriteError::new(&path, e)
-        };
-        fs::create_dir_all(&self.destination).map_err(fail(&self.destination))?;
-        let mut entries = Vec::new();
-        for entry in fs::read_dir(self.path()).map_err(fail(self.path()))? {
-            entries.push(entry.map_err(fail(self.path()))?.file_name());
-        }
-        entries.sort_by_key(|name| name == RECORD);
-        if entries.last().is_some_and(|name| name == RECORD) {
-            remove(&self.destination.join(RECORD)).map_err(fail(&self.destination))?;
-        }
-        for name in entries {
-            let to = self.destination.join(&name);
-            remove(&to).map_err(fail(&to))?;
-            fs::rename(self.path().join(&name), &to).map_err(fail(&to))?;
-        }
-        Ok(())
-    }
-}
-
-fn remove(path: &Path) -> io::Result<()> {
-    let removed = if path.is_dir() && !path.is_symlink() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
-    match removed {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
-        other => other,
     }
 }
 
@@ -221,57 +152,11 @@ fn for_matlab<R>(parts: &[Part<'_>], write: impl FnOnce(&[Variable<'_>]) -> R) -
     write(&variables)
 }
 
-/// Writes every frame of `[T, C, H, W]` as a PNG into `folder`, named by `name(t)`.
-///
-/// # Errors
-/// The file system's or the encoder's, naming the file.
-pub fn write_frames(
-    folder: &Path,
-    video: ArrayView4<'_, f32>,
-    name: impl Fn(usize) -> String,
-) -> Result<(), WriteError> {
-    fs::create_dir_all(folder).map_err(|e| WriteError::new(folder, e))?;
-    for (t, frame) in video.outer_iter().enumerate() {
-        let path = folder.join(name(t));
-        frames::write_png(&path, frame).map_err(|e| WriteError::new(&path, e))?;
-    }
-    Ok(())
-}
-
-/// Writes `[T, C, H, W]` as an animated GIF.
-///
-/// # Errors
-/// The file system's or the encoder's, naming the file.
-pub fn write_preview(path: &Path, video: ArrayView4<'_, f32>, fps: u16) -> Result<(), WriteError> {
-    write_atomically(path, |w| video::write_gif(w, video, fps))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::io::mat;
     use ndarray::Array4;
-
-    #[test]
-    fn a_dropped_staging_leaves_nothing_and_a_committed_one_replaces_only_its_own() {
-        let dir = tempfile::tempdir().unwrap();
-        let out = dir.path().join("run");
-        fs::create_dir(&out).unwrap();
-        fs::write(out.join("notes.txt"), "mine").unwrap();
-        fs::write(out.join(RECORD), "old").unwrap();
-        let staging = Staging::new(&out).unwrap();
-        fs::write(staging.path().join(RECORD), "half").unwrap();
-        drop(staging);
-        assert_eq!(fs::read_to_string(out.join(RECORD)).unwrap(), "old");
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
-        let staging = Staging::new(&out).unwrap();
-        fs::write(staging.path().join(RECORD), "new").unwrap();
-        fs::create_dir(staging.path().join("frames")).unwrap();
-        staging.commit().unwrap();
-        assert_eq!(fs::read_to_string(out.join(RECORD)).unwrap(), "new");
-        assert_eq!(fs::read_to_string(out.join("notes.txt")).unwrap(), "mine");
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
-    }
 
     #[test]
     fn mat_output_reads_back_as_a_scene_part() {

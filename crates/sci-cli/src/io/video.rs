@@ -1,9 +1,12 @@
 //! Owns video files: animated GIF (read and write) and Y4M (read).
 
-use std::io::{Cursor, Write};
+use std::fs;
+use std::io::{self, Cursor, Write};
+use std::path::PathBuf;
 
 use image::{AnimationDecoder, ImageDecoder, Limits, codecs::gif::GifDecoder};
-use ndarray::ArrayView4;
+use ndarray::{ArrayView3, ArrayView4, Axis};
+use rayon::prelude::*;
 
 use super::ReadError;
 use super::frames::{push_planes, to_byte};
@@ -13,6 +16,10 @@ const GIF: &str = ".gif";
 const Y4M: &str = ".y4m";
 /// Longest side accepted, so that no product of sizes can overflow.
 const MAX_SIDE: usize = 1 << 16;
+/// How coarsely the colors of a GIF's frame are sampled for its palette, 1 to 30.
+const PALETTE_SPEED: i32 = 10;
+/// The last byte of a GIF.
+const GIF_END: u8 = 0x3b;
 
 /// Whether the bytes open like a GIF.
 pub fn is_gif(bytes: &[u8]) -> bool {
@@ -161,26 +168,55 @@ fn push_ycc(out: &mut Vec<u8>, [y, u, v]: [&[u8]; 3], space: y4m::Colorspace, (w
 pub fn write_gif(w: impl Write, video: ArrayView4<'_, f32>, fps: u16) -> Result<(), gif::EncodingError> {
     let (_, channels, height, width) = video.dim();
     let side = |n: usize| {
-        u16::try_from(n)
-            .map_err(|_| std::io::Error::new(std::io::ErrorKind::InvalidInput, "a GIF side is at most 65535 pixels"))
+        u16::try_from(n).map_err(|_| io::Error::new(io::ErrorKind::InvalidInput, "a GIF side is at most 65535 pixels"))
     };
     let (height, width) = (side(height)?, side(width)?);
     let ramp: Vec<u8> = (0..=255).flat_map(|g| [g; 3]).collect();
     let palette: &[u8] = if channels == 1 { &ramp } else { &[] };
     let mut encoder = gif::Encoder::new(w, width, height, palette)?;
     encoder.set_repeat(gif::Repeat::Infinite)?;
-    for frame in video.outer_iter() {
-        let mut gif_frame = if channels == 1 {
-            let levels: Vec<u8> = frame.iter().map(|&x| to_byte(x)).collect();
-            gif::Frame { width, height, buffer: levels.into(), ..Default::default() }
-        } else {
-            let rgb: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&x| to_byte(x)).collect();
-            gif::Frame::from_rgb_speed(width, height, &rgb, 10)
-        };
-        gif_frame.delay = 100 / fps.max(1);
-        encoder.write_frame(&gif_frame)?;
+    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
+    let encoded: Vec<gif::Frame<'static>> = frames
+        .par_iter()
+        .map(|frame| {
+            let mut gif_frame = gif_frame(*frame, width, height);
+            gif_frame.delay = 100 / fps.max(1);
+            gif_frame.make_lzw_pre_encoded();
+            gif_frame
+        })
+        .collect();
+    encoded.iter().try_for_each(|frame| encoder.write_lzw_pre_encoded_frame(frame))
+}
+
+fn gif_frame(frame: ArrayView3<'_, f32>, width: u16, height: u16) -> gif::Frame<'static> {
+    if frame.len_of(Axis(0)) == 1 {
+        let levels: Vec<u8> = frame.iter().map(|&x| to_byte(x)).collect();
+        gif::Frame { width, height, buffer: levels.into(), ..Default::default() }
+    } else {
+        let rgb: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&x| to_byte(x)).collect();
+        gif::Frame::from_rgb_speed(width, height, &rgb, PALETTE_SPEED)
     }
-    Ok(())
+}
+
+/// Writes the GIF of several, which [`write_gif`] made of videos of one size, one after the other.
+///
+/// # Errors
+/// The reader's or the writer's error.
+pub fn join_gifs(w: &mut impl Write, parts: &[PathBuf]) -> io::Result<()> {
+    for (i, part) in parts.iter().enumerate() {
+        let bytes = fs::read(part)?;
+        // They begin with the same bytes up to the first frame, and end with one that says so.
+        let frames = bytes.get(if i == 0 { 0 } else { gif_head(&bytes) }..bytes.len() - 1).unwrap_or_default();
+        w.write_all(frames)?;
+    }
+    w.write_all(&[GIF_END])
+}
+
+/// The length of what [`write_gif`] writes before the first frame: header, screen, the palette of a gray video, repetition.
+fn gif_head(bytes: &[u8]) -> usize {
+    const HAS_PALETTE: u8 = 0x80;
+    let palette = if bytes.get(10).is_some_and(|flags| flags & HAS_PALETTE != 0) { 3 * 256 } else { 0 };
+    6 + 7 + palette + 19
 }
 
 #[cfg(test)]
@@ -197,6 +233,27 @@ mod tests {
         assert_eq!(read.shape(), [3, 1, 5, 7]);
         let expected: Vec<u8> = video.iter().map(|&x| to_byte(x)).collect();
         assert_eq!(read.samples(), &Samples::Bytes(expected));
+    }
+
+    #[test]
+    fn joined_gifs_are_the_gif_of_the_joined_videos() {
+        let dir = tempfile::tempdir().unwrap();
+        for channels in [1, 3] {
+            let video =
+                Array4::from_shape_fn((5, channels, 6, 7), |(t, c, y, x)| ((t * 31 + c * 5 + y * x) as f32) / 255.0);
+            let gif = |video: ArrayView4<'_, f32>| {
+                let mut bytes = Vec::new();
+                write_gif(&mut bytes, video, 10).unwrap();
+                bytes
+            };
+            let parts: Vec<PathBuf> = (0..2).map(|i| dir.path().join(format!("{i}.gif"))).collect();
+            let (first, second) = video.view().split_at(Axis(0), 2);
+            fs::write(&parts[0], gif(first)).unwrap();
+            fs::write(&parts[1], gif(second)).unwrap();
+            let mut joined = Vec::new();
+            join_gifs(&mut joined, &parts).unwrap();
+            assert!(joined == gif(video.view()), "{channels} channels");
+        }
     }
 
     #[test]

@@ -23,7 +23,7 @@ function section(title) {
 function table(parent, head, rows) {
   const t = put(put(parent, "div", { class: "scroll" }), "table");
   const tr = put(put(t, "thead"), "tr");
-  head.forEach(h => put(tr, "th", {}, h));
+  head.forEach(h => put(tr, "th", { scope: "col" }, h));
   const body = put(t, "tbody");
   rows.forEach(({ cells, warning }) => {
     const r = put(body, "tr", warning ? { class: "warning" } : {});
@@ -85,7 +85,7 @@ function lines(parent, { label, xLabel, series, log }) {
     put(curve, "title", {}, s.name);
   });
 }
-function bars(parent, values, pick) {
+function bars(parent, values, stride, pick) {
   const known = values.filter(v => v !== null);
   const svg = frameOf(parent, "PSNR of each frame", "frame", WIDE);
   if (!known.length) return [];
@@ -97,9 +97,9 @@ function bars(parent, values, pick) {
   return values.map((v, t) => {
     const at = LEFT + t * step;
     const bar = put(svg, "rect", { class: "bar", x: at + step * .12, width: step * .76, y: v === null ? y(lo) : y(v), height: v === null ? 0 : y(lo) - y(v) });
-    put(bar, "title", {}, `frame ${t}: ${show(v, 2, " dB")}`);
+    put(bar, "title", {}, `frame ${t * stride}: ${show(v, 2, " dB")}`);
     bar.addEventListener("click", () => pick(t));
-    put(svg, "text", { x: at + step / 2, y: H - BOTTOM + 16, "text-anchor": "middle" }, `${t}`);
+    put(svg, "text", { x: at + step / 2, y: H - BOTTOM + 16, "text-anchor": "middle" }, `${t * stride}`);
     return bar;
   });
 }
@@ -164,7 +164,7 @@ function head(r) {
   const list = [
     ["mean PSNR", show(r.mean.psnr_db, 2, " dB")], ["mean SSIM", show(r.mean.ssim, 4)],
     ["seconds a measurement", show(r.mean.seconds, r.mean.seconds < 10 ? 3 : 1)], ["iterations", show(r.mean.iterations, 1).replace(/\.0$/, "")],
-    ["threads", `${r.threads}`], ["seed", `${r.seed}`], ["CPU", r.cpu || "–", true],
+    ["threads", `${r.threads}`], ["seed", `${r.seed}`], ["kernel", [r.kernel, r.precision_used].filter(Boolean).join(" · ") || "–"], ["CPU", r.cpu || "–", true],
     ["sci", [r.version, r.revision].filter(Boolean).join(" · ") || "–", true],
   ];
   if (r.peak_rss_bytes) list.splice(6, 0, ["peak memory", `${Math.round(r.peak_rss_bytes / 2 ** 20)} MiB`]);
@@ -208,6 +208,14 @@ function drawMosaic(canvas, result, [redRow, redColumn]) {
   });
 }
 const ERROR_LIMIT = 0.25;
+/** What of a measurement's pictures had to be left out so that the page keeps its size. */
+function omitted(set) {
+  if (!set.recon.length) return `The ${set.frames} frames are left out so that this page keeps its size (output.report_megabytes).`;
+  const parts = [];
+  if (set.shrink > 1) parts.push(`frames are shown at 1/${set.shrink} of their height and width`);
+  if (set.step > 1) parts.push(`of every ${set.step} frames one is shown`);
+  return parts.length ? `So that this page keeps its size (output.report_megabytes), ${parts.join(", and ")}.` : "";
+}
 function viewer(r, images) {
   const box = section("Frames");
   const controls = put(box, "div", { class: "controls" });
@@ -215,7 +223,7 @@ function viewer(r, images) {
   r.measurements.forEach((m, i) => put(choice, "option", { value: i }, `measurement ${m.index} · ${m.psnr_db === null ? small(m.relative_residual) + " residual" : show(m.psnr_db, 2, " dB")}`));
   const play = put(controls, "button", { type: "button", id: "play", "aria-pressed": "false" }, "play");
   const slider = put(controls, "input", { type: "range", id: "frame", min: 0, value: 0, step: 1, "aria-label": "frame" });
-  const readout = put(controls, "output", { id: "readout", for: "frame" });
+  const readout = put(controls, "output", { id: "readout", for: "frame", "aria-live": "off" });
   const grid = put(box, "div", { class: "images" });
   const figure = (tag, id, caption) => {
     const f = put(grid, "figure");
@@ -223,18 +231,20 @@ function viewer(r, images) {
     put(f, "figcaption", {}, caption);
     return [f, node];
   };
-  const [, measured] = figure("img", "measured", "measurement (one exposure, scaled to its largest value)");
+  const [measuredBox, measured] = figure("img", "measured", "measurement (one exposure, scaled to its largest value)");
   const [mosaicBox, mosaic] = figure("canvas", "mosaic", "mosaic (the result as the sensor reads it through its color filters)");
   const [, result] = figure("img", "result", "result");
   const [truthBox, truth] = figure("img", "truth", "truth");
   const [errorBox, error] = figure("canvas", "error", `|error|, white from ${ERROR_LIMIT} of full scale`);
   const perFrame = section("PSNR of each frame (dB)");
   const skippedBox = put(box, "p", { class: "note", id: "skipped" });
+  const leftOut = put(box, "p", { class: "note", id: "left-out" });
   let barList = [], timer = null;
   const now = () => images[+choice.value];
   const ready = image => image.decode ? image.decode() : Promise.resolve();
   function frame() {
     const set = now(), t = +slider.value;
+    if (!set.recon.length) { readout.textContent = "no frames"; return; }
     result.src = set.recon[t];
     result.dataset.frame = t;
     if (set.red_site) ready(result).then(() => { if (+slider.value === t) drawMosaic(mosaic, result, set.red_site); }, () => {});
@@ -243,18 +253,22 @@ function viewer(r, images) {
       Promise.all([ready(result), ready(truth)]).then(() => { if (+slider.value === t) drawError(error, result, truth, ERROR_LIMIT); }, () => {});
     }
     const psnr = set.psnr_db[t];
-    readout.textContent = `frame ${t} of 0–${set.recon.length - 1}` + (psnr === undefined ? "" : ` · ${show(psnr, 2, " dB")}`);
+    readout.textContent = `frame ${t * set.step} of 0–${set.frames - 1}` + (psnr === undefined ? "" : ` · ${show(psnr, 2, " dB")}`);
     barList.forEach((b, k) => b.classList.toggle("now", k === t));
   }
   function measurement() {
     const set = now(), m = r.measurements[+choice.value], s = m.skipped;
-    measured.src = set.measurement;
-    slider.max = set.recon.length - 1;
-    mosaicBox.hidden = !set.red_site;
-    truthBox.hidden = errorBox.hidden = !set.truth;
+    measured.src = set.measurement ?? "data:,";
+    measuredBox.hidden = !set.measurement;
+    slider.max = Math.max(0, set.recon.length - 1);
+    result.parentElement.hidden = !set.recon.length;
+    mosaicBox.hidden = !set.red_site || !set.recon.length;
+    truthBox.hidden = errorBox.hidden = !set.truth || !set.recon.length;
     perFrame.hidden = !set.psnr_db.length;
     perFrame.querySelectorAll("svg").forEach(n => n.remove());
-    barList = set.psnr_db.length ? bars(perFrame, set.psnr_db, t => { slider.value = t; slider.dispatchEvent(new Event("input")); }) : [];
+    leftOut.textContent = omitted(set);
+    leftOut.hidden = !leftOut.textContent;
+    barList = set.psnr_db.length ? bars(perFrame, set.psnr_db, set.step, t => { slider.value = t; slider.dispatchEvent(new Event("input")); }) : [];
     const parts = [[s.iterations, "iterations"], [s.tiles ? `${(100 * s.tiles).toFixed(1)} %` : 0, "of the denoiser's tiles"], [s.precision ? `${(100 * s.precision).toFixed(0)} %` : 0, "of the networks' work in f32"], [s.updates, "online updates"]].filter(([n]) => n).map(([n, what]) => `${n} ${what}`);
     skippedBox.textContent = `Skipped: ${parts.join(", ") || "nothing"}. Ended: ${words(m.stop)} after ${m.iterations} iterations.`;
     frame();
@@ -263,6 +277,7 @@ function viewer(r, images) {
   choice.addEventListener("change", measurement);
   const move = by => {
     const n = now().recon.length;
+    if (!n) return;
     slider.value = (+slider.value + by + n) % n;
     slider.dispatchEvent(new Event("input"));
   };
@@ -273,9 +288,13 @@ function viewer(r, images) {
     play.textContent = timer ? "pause" : "play";
   });
   document.addEventListener("keydown", e => {
+    // Keys that mean something to the browser, or to what has the focus, are theirs.
+    if (e.altKey || e.ctrlKey || e.metaKey || e.shiftKey || e.defaultPrevented) return;
+    if (e.target instanceof Element && e.target.closest("summary, select, button, input, textarea, a")) return;
     const step = { ArrowLeft: -1, ArrowRight: 1 }[e.key];
-    if (step && e.target !== slider && e.target !== choice) { e.preventDefault(); move(step); }
-    if (e.key === " " && e.target.tagName !== "BUTTON") { e.preventDefault(); play.click(); }
+    if (!step && e.key !== " ") return;
+    e.preventDefault();
+    if (step) move(step); else play.click();
   });
   measurement();
   // A link may name the place: report.html#measurement=1&frame=5&play

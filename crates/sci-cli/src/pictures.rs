@@ -1,0 +1,173 @@
+//! Owns the pictures of a run, frames, preview and the report's pieces: made of one measurement while the next is solved.
+
+use std::fs;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, sync_channel};
+
+use admm::Estimate;
+use anyhow::Context;
+use image::ImageError;
+use ndarray::{Array4, ArrayView3, ArrayView4, Axis, stack};
+use rayon::prelude::*;
+
+use crate::config::resolve::Output;
+use crate::io::output::{WriteError, write_atomically};
+use crate::io::scene::Scene;
+use crate::io::{frames, video};
+use crate::report::pictures::{MeasurementImages, Pictures};
+use crate::run_folder::{Finished, read_video};
+
+/// The file of the animated GIF, of a measurement and of the run.
+pub const PREVIEW: &str = "preview.gif";
+/// The file of a measurement's piece of the report.
+pub const PIECE: &str = "report.json";
+/// A preview is halved until its longer side is at most this.
+const PREVIEW_SIDE: usize = 1000;
+
+/// The file of frame `t` of measurement `index`.
+pub fn frame_name(index: usize, t: usize) -> String {
+    format!("m{index:02}_t{t:02}.png")
+}
+
+/// A measurement that has just been solved.
+#[derive(Debug)]
+pub struct Job {
+    /// On disk.
+    pub finished: Finished,
+    /// Its estimate.
+    pub estimate: Estimate,
+    /// Whether no other one follows.
+    pub last: bool,
+}
+
+/// What makes the pictures of a run.
+#[derive(Debug)]
+pub struct Studio<'a> {
+    /// Where measurements and truth are.
+    pub scene: &'a Scene,
+    /// What is wanted.
+    pub output: Output,
+    /// What the report may take of each measurement, in bytes.
+    pub report_bytes: usize,
+}
+
+impl Studio<'_> {
+    /// Runs `solve`, which hands every solved measurement to its argument, and makes the pictures of `solved` before and of these
+    /// meanwhile, on threads of their own: the solver's are never held up by a picture. At most one measurement waits. The
+    /// argument gives `false` once something went wrong.
+    ///
+    /// # Errors
+    /// That of `solve`, else that of the pictures.
+    pub fn in_step<R>(
+        &self,
+        solved: &[Finished],
+        solve: impl FnOnce(&dyn Fn(Job) -> bool) -> anyhow::Result<R>,
+    ) -> anyhow::Result<R> {
+        let threads = rayon::current_num_threads();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("cannot start threads")?;
+        std::thread::scope(|scope| {
+            let (sender, receiver) = sync_channel(0);
+            let studio = scope.spawn(move || pool.install(|| self.make_all(solved, receiver)));
+            let result = solve(&|job| sender.send(job).is_ok());
+            drop(sender);
+            let made = studio.join().map_err(|_| anyhow::anyhow!("a picture could not be made"))?;
+            let result = result?;
+            made?;
+            Ok(result)
+        })
+    }
+
+    /// Ends, and with it the receiver, with the first error.
+    fn make_all(&self, solved: &[Finished], jobs: Receiver<Job>) -> anyhow::Result<()> {
+        for finished in solved.iter().filter(|f| self.is_wanted() && !f.pictures().exists()) {
+            self.make(finished, read_video(&finished.video())?.view())?;
+        }
+        for Job { finished, estimate, last } in jobs {
+            if self.is_wanted() {
+                self.make(&finished, estimate.video())?;
+            }
+            drop(estimate);
+            // After the last there is nothing to hide it behind, and it is about to be moved into place.
+            if !last {
+                finished.sync()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn is_wanted(&self) -> bool {
+        self.output.frames || self.output.preview || self.output.report
+    }
+
+    fn make(&self, finished: &Finished, result: ArrayView4<'_, f32>) -> Result<(), WriteError> {
+        let index = finished.record.index;
+        finished.make_pictures(|dir| {
+            let frames = if self.output.frames { Some(self.frames(dir, index, result)?) } else { None };
+            if self.output.preview {
+                self.preview(&dir.join(PREVIEW), result)?;
+            }
+            if self.output.report {
+                self.piece(&dir.join(PIECE), index, result, frames)?;
+            }
+            Ok(())
+        })
+    }
+
+    /// Each frame as a PNG, which the report may use too.
+    fn frames(&self, dir: &Path, index: usize, result: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, WriteError> {
+        let pngs = pngs(result).map_err(|e| WriteError::new(dir, e))?;
+        for (t, png) in pngs.iter().enumerate() {
+            let path = dir.join(frame_name(index, t));
+            fs::write(&path, png).map_err(|e| WriteError::new(&path, e))?;
+        }
+        Ok(pngs)
+    }
+
+    fn preview(&self, path: &Path, result: ArrayView4<'_, f32>) -> Result<(), WriteError> {
+        let (_, _, height, width) = result.dim();
+        let small = (height.max(width) > PREVIEW_SIDE).then(|| halved_to(result, PREVIEW_SIDE));
+        let shown = small.as_ref().map_or(result, |small| small.view());
+        write_atomically(path, |w| video::write_gif(w, shown, self.output.fps))
+    }
+
+    fn piece(
+        &self,
+        path: &Path,
+        index: usize,
+        result: ArrayView4<'_, f32>,
+        frames: Option<Vec<Vec<u8>>>,
+    ) -> Result<(), WriteError> {
+        let images = MeasurementImages {
+            measurement: Some(self.scene.y(index)),
+            recon: result,
+            cfa: self.scene.cfa,
+            truth: if result.len_of(Axis(1)) == 3 {
+                self.scene.rgb_of(index)
+            } else {
+                self.scene.truth_of(index).map(|t| t.insert_axis(Axis(1)))
+            },
+        };
+        let pictures = Pictures::of(&images, frames, self.report_bytes).map_err(|e| WriteError::new(path, e))?;
+        let json = serde_json::to_vec(&pictures).map_err(|e| WriteError::new(path, e))?;
+        fs::write(path, json).map_err(|e| WriteError::new(path, e))
+    }
+}
+
+/// Each frame of `[T, C, H, W]` as a PNG.
+///
+/// # Errors
+/// The encoder's.
+pub fn pngs(video: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, ImageError> {
+    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
+    frames.par_iter().map(|frame| frames::png(*frame)).collect()
+}
+
+/// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
+pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
+    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
+    let halved: Vec<_> = frames.par_iter().map(|frame| frames::halved(*frame)).collect();
+    let views: Vec<_> = halved.iter().map(|frame| frame.view()).collect();
+    let small = stack(Axis(0), &views).expect("frames of a video are of one size");
+    let (_, _, height, width) = small.dim();
+    if height.max(width) > side { halved_to(small.view(), side) } else { small }
+}
