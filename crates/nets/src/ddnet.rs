@@ -12,7 +12,7 @@
 
 use crate::fastdvdnet::{check_widths, recognise_blocks};
 use crate::layers::{Conv, Source};
-use crate::network::{Network, Padding, Window, check_clips, copy_to, reflect, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, copy_to, reflect, to_tensor};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
@@ -136,7 +136,7 @@ fn shift(cfa: CfaPattern) -> (usize, usize) {
     }
 }
 
-impl Network for Ddnet {
+impl Layers for Ddnet {
     fn describe(&self) -> String {
         self.spec.to_string()
     }
@@ -145,6 +145,16 @@ impl Network for Ddnet {
         3
     }
 
+    fn convs(&self) -> Vec<&Conv> {
+        self.net.convs()
+    }
+
+    fn convs_mut(&mut self) -> Vec<&mut Conv> {
+        self.net.convs_mut()
+    }
+}
+
+impl Network for Ddnet {
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
         check_clips(self, clips, noise)?;
         Ok(self.net.forward(clips, noise)?)
@@ -161,14 +171,6 @@ impl Network for Ddnet {
 
     fn padded(&self, clip: &Tensor) -> Result<Tensor> {
         Ok(Padding::Reflect.pad(clip, 4)?)
-    }
-
-    fn convs(&self) -> Vec<&Conv> {
-        self.net.convs()
-    }
-
-    fn convs_mut(&mut self) -> Vec<&mut Conv> {
-        self.net.convs_mut()
     }
 }
 

@@ -8,7 +8,7 @@
 //! Tassano, Delon, Veit, *FastDVDnet: towards real-time deep video denoising without flow estimation*, CVPR 2020.
 
 use crate::layers::{Conv, Source};
-use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, to_tensor};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
@@ -146,31 +146,13 @@ impl Fastdvdnet {
     }
 }
 
-impl Network for Fastdvdnet {
+impl Layers for Fastdvdnet {
     fn describe(&self) -> String {
         self.spec.to_string()
     }
 
     fn channels(&self) -> usize {
         self.spec.channels
-    }
-
-    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
-        check_clips(self, clips, noise)?;
-        Ok(self.net.forward(clips, noise)?)
-    }
-
-    /// Triplets through the first block, then triplets of its results through the second.
-    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
-        self.net.stages(frames)
-    }
-
-    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor> {
-        Ok(self.net.forward_window(stage, inputs, noise)?)
-    }
-
-    fn padded(&self, clip: &Tensor) -> Result<Tensor> {
-        Ok(Padding::Reflect.pad(clip, 4)?)
     }
 
     fn convs(&self) -> Vec<&Conv> {
@@ -188,6 +170,26 @@ impl Network for Fastdvdnet {
             }
         }
         Ok(())
+    }
+}
+
+impl Network for Fastdvdnet {
+    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
+        check_clips(self, clips, noise)?;
+        Ok(self.net.forward(clips, noise)?)
+    }
+
+    /// Triplets through the first block, then triplets of its results through the second.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        self.net.stages(frames)
+    }
+
+    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor> {
+        Ok(self.net.forward_window(stage, inputs, noise)?)
+    }
+
+    fn padded(&self, clip: &Tensor) -> Result<Tensor> {
+        Ok(Padding::Reflect.pad(clip, 4)?)
     }
 }
 

@@ -15,7 +15,7 @@
 use crate::infer::{Cache, channel_row, set_channel};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source, chain};
-use crate::network::{Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
 use admm::{BoxError, Call, Denoiser};
@@ -183,7 +183,7 @@ impl Ffdnet {
         let (c, h, w) = frame.dim();
         let (half_h, half_w) = (h.div_ceil(2), w.div_ceil(2));
         let convs: Vec<&Conv> = self.layers.iter().collect();
-        let engine = self.cache.engine(&convs, &[])?;
+        let engine = self.cache.engine(&convs, &[], &[])?;
         engine.start(half_h, half_w);
         let mut z = engine.image(4 * c + 1, half_h, half_w);
         set_channel(&mut z, if residual { 0 } else { 4 * c }, |_| std::iter::repeat(sigma));
@@ -217,35 +217,13 @@ impl Ffdnet {
     }
 }
 
-impl Network for Ffdnet {
+impl Layers for Ffdnet {
     fn describe(&self) -> String {
         self.spec.to_string()
     }
 
     fn channels(&self) -> usize {
         self.spec.channels
-    }
-
-    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
-        let (n, _, h, w) = check_clips(self, clips, noise)?;
-        // [N, C, H, W] -> [N, 4C, H/2, W/2] -> [N, 4C + 1, H/2, W/2]
-        let z = pixel_unshuffle(&Padding::Replicate.pad(clips, 2)?, 2)?;
-        let map = noise_map(n, noise, &z)?;
-        let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
-        let z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
-        let z = chain(&self.layers, &[], &z)?;
-        let image = crop(&pixel_shuffle(&z, 2)?, h, w)?;
-        Ok(if residual { (clips - image)? } else { image })
-    }
-
-    /// Each frame on its own.
-    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
-        vec![(0..frames).map(|t| Window { inputs: vec![t], outputs: t..t + 1 }).collect()]
-    }
-
-    /// One pixel of the half-size images in each layer, and the other pixel of a pair.
-    fn reach(&self) -> Option<usize> {
-        Some(2 * self.spec.depth + 2)
     }
 
     fn convs(&self) -> Vec<&Conv> {
@@ -266,6 +244,30 @@ impl Network for Ffdnet {
             }
         }
         Ok(())
+    }
+}
+
+impl Network for Ffdnet {
+    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
+        let (n, _, h, w) = check_clips(self, clips, noise)?;
+        // [N, C, H, W] -> [N, 4C, H/2, W/2] -> [N, 4C + 1, H/2, W/2]
+        let z = pixel_unshuffle(&Padding::Replicate.pad(clips, 2)?, 2)?;
+        let map = noise_map(n, noise, &z)?;
+        let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
+        let z = if residual { Tensor::cat(&[&map, &z], 1)? } else { Tensor::cat(&[&z, &map], 1)? };
+        let z = chain(&self.layers, &[], &z)?;
+        let image = crop(&pixel_shuffle(&z, 2)?, h, w)?;
+        Ok(if residual { (clips - image)? } else { image })
+    }
+
+    /// Each frame on its own.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        vec![(0..frames).map(|t| Window { inputs: vec![t], outputs: t..t + 1 }).collect()]
+    }
+
+    /// One pixel of the half-size images in each layer, and the other pixel of a pair.
+    fn reach(&self) -> Option<usize> {
+        Some(2 * self.spec.depth + 2)
     }
 }
 

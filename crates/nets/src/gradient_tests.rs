@@ -1,7 +1,7 @@
 //! Gradients of whole networks against central differences of the same network in f64, on candle's own operations.
 
 use crate::layers::Conv;
-use crate::{Ddnet, DdnetSpec, Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network};
+use crate::{Ddnet, DdnetSpec, Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network};
 use candle_core::{DType, Device, Tensor};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

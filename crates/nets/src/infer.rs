@@ -16,8 +16,8 @@ pub(crate) struct Engine {
 
 impl Engine {
     /// Packs the layers, batch norm folded. The outputs of the layers in `shuffled` are put in the order that
-    /// [`Engine::add_shuffled`] needs.
-    pub(crate) fn new(convs: &[&Conv], shuffled: &[usize]) -> Result<Self> {
+    /// [`Engine::add_shuffled`] needs; the results of the layers in `plain` are held in f32.
+    pub(crate) fn new(convs: &[&Conv], shuffled: &[usize], plain: &[usize]) -> Result<Self> {
         let isa = Isa::detect()?;
         let pack = |(i, conv): (usize, &&Conv)| {
             let opts = conv.inference();
@@ -28,16 +28,20 @@ impl Engine {
             if opts.groups > 1 {
                 filters.spread_outputs(opts.groups);
             }
+            let result = |channels: usize| match plain.contains(&i) {
+                true => Form::Single,
+                false => form(isa, opts.precision, channels),
+            };
             if shuffled.contains(&i) {
-                filters.order_by_phase(form(isa, opts.precision, filters.outputs / 4));
+                filters.order_by_phase(result(filters.outputs / 4));
             }
             let Filters { inputs, outputs, values, bias } = filters;
-            let form = |channels: usize| form(isa, opts.precision, channels);
             // What the matrix unit would not gain from stays in f32, as the input of the first layer does.
-            let precision = if form(inputs) == Form::Half { Precision::Bf16 } else { Precision::F32 };
+            let precision =
+                if form(isa, opts.precision, inputs) == Form::Half { Precision::Bf16 } else { Precision::F32 };
             let opts = Conv3x3 { precision, ..opts };
             let packed = PackedConv::new_on(isa, &values, bias.as_deref(), inputs, outputs, opts)?;
-            Ok((if shuffled.contains(&i) { packed } else { packed.giving(form(outputs)) }, opts))
+            Ok((if shuffled.contains(&i) { packed } else { packed.giving(result(outputs)) }, opts))
         };
         Ok(Self { convs: convs.iter().enumerate().map(pack).collect::<Result<_>>()?, ..Self::default() })
     }
@@ -113,13 +117,13 @@ impl Clone for Cache {
 impl Cache {
     /// The engine for the layers. Variables may have changed since the last call, so they are packed anew each time,
     /// which costs little beside running them.
-    pub(crate) fn engine(&mut self, convs: &[&Conv], shuffled: &[usize]) -> Result<&mut Engine> {
+    pub(crate) fn engine(&mut self, convs: &[&Conv], shuffled: &[usize], plain: &[usize]) -> Result<&mut Engine> {
         if convs.iter().any(|conv| conv.is_variable()) {
             self.0 = None;
         }
         match &mut self.0 {
             Some(engine) => Ok(engine),
-            none => Ok(none.insert(Engine::new(convs, shuffled)?)),
+            none => Ok(none.insert(Engine::new(convs, shuffled, plain)?)),
         }
     }
 

@@ -92,6 +92,12 @@ impl Conv {
         Ok(Self { name, opts, inference: Precision::F32, weight, bias, norm, input_means: None })
     }
 
+    /// Makes the layer's products zero: it begins as nothing but its bias.
+    pub(crate) fn silence(&mut self) -> candle_core::Result<()> {
+        self.weight = self.weight.zeros_like()?;
+        Ok(())
+    }
+
     /// How inference does the layer.
     pub(crate) fn inference(&self) -> Conv3x3 {
         Conv3x3 { precision: self.inference, ..self.opts }

@@ -3,7 +3,7 @@
 //!
 //! ```
 //! use admm::{Call, Denoiser};
-//! use nets::{Ffdnet, FfdnetSpec, Network};
+//! use nets::{Ffdnet, FfdnetSpec, Layers};
 //! use ndarray::Array4;
 //!
 //! let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0)?;
@@ -26,6 +26,7 @@ mod layers;
 mod mixed_precision;
 mod network;
 pub mod train;
+mod unfolding;
 mod video;
 pub mod weights;
 
@@ -35,7 +36,8 @@ pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};
 pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
 pub use layers::Parameters;
 pub use mixed_precision::{MixedPrecision, PrecisionCounter, PrecisionCounts, SelectPrecision};
-pub use network::{Network, Window};
+pub use network::{Layers, Network, Window};
+pub use unfolding::{Unfolding, UnfoldingNet, UnfoldingPrior, UnfoldingSpec};
 pub use video::Ends;
 pub use weights::WeightFile;
 

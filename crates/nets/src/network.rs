@@ -17,57 +17,14 @@ pub struct Window {
     pub outputs: Range<usize>,
 }
 
-/// A denoising or demosaicing network whose tensors have the names of its published implementation.
-pub trait Network: Send + Sync {
+/// The named layers of a network: what loading, saving and training need of it. The tensors have the names of its published
+/// implementation.
+pub trait Layers: Send + Sync {
     /// What it is, with its size, for messages: `"FFDNet (gray, 64 channels, 15 layers)"`.
     fn describe(&self) -> String;
 
     /// Channels of a frame, `C`: 1 gray, 3 RGB.
     fn channels(&self) -> usize;
-
-    /// The network as a differentiable function of its input and its trainable tensors.
-    ///
-    /// `clips [N, C, H, W]` holds `noise.len()` clips of equal length one after another; `noise` is the σ of each, on
-    /// the scale of the frames (networks without a noise map ignore its values). The result has the shape of the input.
-    ///
-    /// # Errors
-    /// [`Error::Channels`], [`Error::Shape`] when `N` is not a multiple of `noise.len()` or a frame is empty,
-    /// [`Error::Sigma`].
-    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor, Error>;
-
-    /// [`Network::forward`] of one clip taken apart, so that its gradient can be had with the memory of one window:
-    /// for each stage the windows, in the order of their outputs, for a clip of `frames` frames.
-    ///
-    /// A stage maps `[inputs, C, H, W]` to `[outputs, C, H, W]` by [`Network::forward_window`]; the first reads
-    /// [`Network::padded`] frames, the results of the last, cut back to the size of the frames, are those of `forward`.
-    /// A network that does not say otherwise is one stage of one window.
-    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
-        vec![vec![Window { inputs: (0..frames).collect(), outputs: 0..frames }]]
-    }
-
-    /// One window of one stage of [`Network::stages`], differentiable in `inputs` and the trainable tensors.
-    ///
-    /// # Errors
-    /// As [`Network::forward`].
-    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor, Error> {
-        debug_assert_eq!(stage, 0);
-        self.forward(inputs, &[noise])
-    }
-
-    /// How many rows away a row of a frame can change a row of the result, rounded up to a multiple of what
-    /// [`Network::padded`] continues frames to, so that a strip cut out with as many rows around it has the same result;
-    /// nothing where strips are not worth it.
-    fn reach(&self) -> Option<usize> {
-        None
-    }
-
-    /// Frames `[T, C, H, W]` continued to the size that [`Network::forward_window`] takes.
-    ///
-    /// # Errors
-    /// When a tensor operation fails.
-    fn padded(&self, clip: &Tensor) -> Result<Tensor, Error> {
-        Ok(clip.clone())
-    }
 
     #[doc(hidden)]
     fn convs(&self) -> Vec<&Conv>;
@@ -107,7 +64,7 @@ pub trait Network: Send + Sync {
         self.make_some_trainable(Parameters::All)
     }
 
-    /// [`Network::make_trainable`] of a part of the tensors. What was trainable before stays so.
+    /// [`Layers::make_trainable`] of a part of the tensors. What was trainable before stays so.
     ///
     /// # Errors
     /// When memory for the variables cannot be had.
@@ -128,7 +85,7 @@ pub trait Network: Send + Sync {
         Ok(vars)
     }
 
-    /// Replaces every tensor by that of the same name in a [`Network::state`]; nothing is trainable afterwards.
+    /// Replaces every tensor by that of the same name in a [`Layers::state`]; nothing is trainable afterwards.
     ///
     /// # Errors
     /// [`Error::State`] when names or shapes are not the network's own; it is unchanged then.
@@ -191,6 +148,53 @@ pub trait Network: Send + Sync {
             conv.clone().tensors_mut().iter().filter(|(.., trainable)| *trainable).map(|(_, t, _)| t.elem_count()).sum()
         };
         self.convs().into_iter().map(trainable).sum()
+    }
+}
+
+/// A network that denoises or demosaics frames.
+pub trait Network: Layers {
+    /// The network as a differentiable function of its input and its trainable tensors.
+    ///
+    /// `clips [N, C, H, W]` holds `noise.len()` clips of equal length one after another; `noise` is the σ of each, on
+    /// the scale of the frames (networks without a noise map ignore its values). The result has the shape of the input.
+    ///
+    /// # Errors
+    /// [`Error::Channels`], [`Error::Shape`] when `N` is not a multiple of `noise.len()` or a frame is empty,
+    /// [`Error::Sigma`].
+    fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor, Error>;
+
+    /// [`Network::forward`] of one clip taken apart, so that its gradient can be had with the memory of one window:
+    /// for each stage the windows, in the order of their outputs, for a clip of `frames` frames.
+    ///
+    /// A stage maps `[inputs, C, H, W]` to `[outputs, C, H, W]` by [`Network::forward_window`]; the first reads
+    /// [`Network::padded`] frames, the results of the last, cut back to the size of the frames, are those of `forward`.
+    /// A network that does not say otherwise is one stage of one window.
+    fn stages(&self, frames: usize) -> Vec<Vec<Window>> {
+        vec![vec![Window { inputs: (0..frames).collect(), outputs: 0..frames }]]
+    }
+
+    /// One window of one stage of [`Network::stages`], differentiable in `inputs` and the trainable tensors.
+    ///
+    /// # Errors
+    /// As [`Network::forward`].
+    fn forward_window(&self, stage: usize, inputs: &Tensor, noise: f32) -> Result<Tensor, Error> {
+        debug_assert_eq!(stage, 0);
+        self.forward(inputs, &[noise])
+    }
+
+    /// How many rows away a row of a frame can change a row of the result, rounded up to a multiple of what
+    /// [`Network::padded`] continues frames to, so that a strip cut out with as many rows around it has the same result;
+    /// nothing where strips are not worth it.
+    fn reach(&self) -> Option<usize> {
+        None
+    }
+
+    /// Frames `[T, C, H, W]` continued to the size that [`Network::forward_window`] takes.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    fn padded(&self, clip: &Tensor) -> Result<Tensor, Error> {
+        Ok(clip.clone())
     }
 }
 

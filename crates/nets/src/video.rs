@@ -243,8 +243,12 @@ impl VideoNet {
         mut out: ArrayViewMut4<'_, f32>,
     ) -> Result<()> {
         let convs: Vec<&Conv> = self.blocks.iter().flat_map(|b| &b.convs).collect();
-        let mut run =
-            BlockRun { engine: self.cache.engine(&convs, &SHUFFLED)?, spec: self.spec, residual: self.residual, sigma };
+        let mut run = BlockRun {
+            engine: self.cache.engine(&convs, &SHUFFLED, &[])?,
+            spec: self.spec,
+            residual: self.residual,
+            sigma,
+        };
         let (frames, c, h, w) = video.dim();
         let windows = Windows::new(frames, self.ends);
         let (ph, pw) = (h.next_multiple_of(4), w.next_multiple_of(4));

@@ -4,7 +4,7 @@ use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array0, Array4, ArrayD, ArrayView4};
 use ndarray_npy::{NpzReader, ReadNpzError};
-use nets::{Ends, Fastdvdnet, Ffdnet, Network, WeightFile};
+use nets::{Ends, Fastdvdnet, Ffdnet, Layers, Network, WeightFile};
 use std::fs::File;
 use std::path::Path;
 

@@ -37,6 +37,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
         renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 50.0] }),
         iterates: None,
+        snapshots: None,
         training: TrainingConfig {
             steps,
             optimizer: Optimizer::Muon,

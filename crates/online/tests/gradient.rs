@@ -5,7 +5,7 @@ use candle_core::{Device, Tensor, Var};
 use ndarray::{Array0, Array1, Array2, Array3, Array4, ArrayView4};
 use ndarray_npy::NpzReader;
 use nets::kernels::Isa;
-use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Network, Parameters};
+use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network, Parameters};
 use online::{PixelSplit, accumulate_gradient};
 use sci_forward::testing::{gaussian, uniform};
 use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};

@@ -11,7 +11,7 @@ use admm::{
 use anyhow::Context;
 use ndarray::{Array4, ArrayView3, ArrayViewMut4};
 use nets::kernels::{Isa, Precision};
-use nets::{MixedPrecision, Network, PrecisionCounter, PrecisionCounts};
+use nets::{Layers, MixedPrecision, Network, PrecisionCounter, PrecisionCounts};
 use online::{AdaptiveDenoiser, Reuse, Sequence, Task, Update, UpdateCounts};
 use sci_forward::bayer::{Bilinear, Malvar, Menon};
 use sci_forward::{CfaPattern, Demosaicer, Measurement};

@@ -140,7 +140,7 @@ pub(super) fn hold_open(
 mod tests {
     use super::*;
     use crate::train::NetworkConfig;
-    use crate::{Ffdnet, Network};
+    use crate::{Ffdnet, Layers};
 
     #[test]
     fn the_gradient_around_the_mean_is_that_of_a_layer_without_one() {

@@ -69,7 +69,7 @@ pub(super) fn read(path: &Path) -> Result<(Meta, BTreeMap<String, Tensor>)> {
 pub(super) fn check_same_run(path: &Path, saved: &TrainConfig, now: &TrainConfig) -> Result<()> {
     let value = |config: &TrainConfig| serde_json::to_value(config).map_err(|e| Error::format(path, e.to_string()));
     let (saved, now) = (value(saved)?, value(now)?);
-    for part in ["seed", "network", "data", "noise", "training"] {
+    for part in ["seed", "network", "data", "noise", "snapshots", "training"] {
         // Where the data lies may change; what is cut from it may not.
         let strip = |config: &serde_json::Value| {
             let mut part = config[part].clone();

@@ -2,7 +2,7 @@
 
 use crate::kernels::Precision;
 use crate::video::Ends;
-use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result};
+use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, UnfoldingSpec};
 use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -27,12 +27,15 @@ pub struct TrainConfig {
     /// shut is at first what it was. Default none.
     #[serde(default)]
     pub renew: Vec<String>,
-    /// The noise put on its input; this or `iterates`.
+    /// The noise put on its input; this, `iterates` or `snapshots`.
     #[serde(default)]
     pub noise: Option<NoiseConfig>,
-    /// The solver whose iterates are its input; this or `noise`.
+    /// The solver whose iterates are its input.
     #[serde(default)]
     pub iterates: Option<IteratesConfig>,
+    /// The cameras whose measurements an unfolding network is trained to solve.
+    #[serde(default)]
+    pub snapshots: Option<SnapshotsConfig>,
     /// How it is trained.
     pub training: TrainingConfig,
     /// How it is watched.
@@ -75,13 +78,26 @@ pub enum NetworkConfig {
         #[serde(default)]
         ends: Ends,
     },
+    /// [`UnfoldingNet`](crate::UnfoldingNet).
+    Unfolding {
+        /// 1 gray, 3 RGB.
+        channels: usize,
+        /// Iterations, 1 to 32.
+        iterations: usize,
+        /// Channels at a half, a quarter and an eighth of the size, multiples of 16 up to 512.
+        widths: [usize; 3],
+        /// Residual blocks at an eighth of the size, 1 to 16.
+        depth: usize,
+    },
 }
 
 impl NetworkConfig {
     /// Colors of a frame: 1 or 3.
     pub fn channels(&self) -> usize {
         match *self {
-            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } => channels,
+            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } | Self::Unfolding { channels, .. } => {
+                channels
+            }
             Self::Ddnet { .. } => 3,
         }
     }
@@ -96,6 +112,10 @@ impl NetworkConfig {
 
     pub(super) fn ddnet(widths: [usize; 3]) -> DdnetSpec {
         DdnetSpec { widths }
+    }
+
+    pub(super) fn unfolding(channels: usize, iterations: usize, widths: [usize; 3], depth: usize) -> UnfoldingSpec {
+        UnfoldingSpec { channels, iterations, widths, depth }
     }
 }
 
@@ -194,6 +214,51 @@ pub struct IteratesConfig {
     /// holes stands pixels that are held out or defective. Default 0.
     #[serde(default)]
     pub holes: f64,
+}
+
+/// Training of an unfolding network: each clip is measured by a new simulated camera, and the loss is that of the result of every
+/// iteration of the solve.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SnapshotsConfig {
+    /// Frames of a measurement, the fewest and the most, drawn for each clip; 1 to 64.
+    pub frames: [usize; 2],
+    /// Share of open pixels of random, shifting and blocky masks, the least and the most; in (0, 1].
+    pub density: [f64; 2],
+    /// Kinds of masks, one drawn for each clip; a kind that is named twice comes twice as often.
+    pub masks: Vec<MaskKind>,
+    /// Largest σ of the noise of y in 0..255 units, white and shot noise in any proportion; half of the clips have nearly none.
+    pub noise: f32,
+    /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. Default 0.
+    #[serde(default)]
+    pub holes: f64,
+    /// Share of the clips whose brightest pixels are clipped. Default 0.
+    #[serde(default)]
+    pub saturated: f64,
+    /// Share of the clips whose masks are told with errors of up to 0.3 pixels, 3 % of gain and a pedestal of 1 %. Default 0.
+    #[serde(default)]
+    pub mask_errors: f64,
+}
+
+/// How masks look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MaskKind {
+    /// Each pixel of each frame open or shut at random.
+    Random,
+    /// One random pattern that moves by one to three pixels a frame, as in cameras.
+    Shifting,
+    /// Squares of two to four pixels open or shut together.
+    Blocky,
+    /// The code of each pixel is a row of a Hadamard matrix.
+    Hadamard,
+    /// Any transmittance, alike in neighbouring pixels.
+    Gray,
+}
+
+impl MaskKind {
+    /// All kinds.
+    pub const ALL: [Self; 5] = [Self::Random, Self::Shifting, Self::Blocky, Self::Hadamard, Self::Gray];
 }
 
 /// How weights follow gradients; both take the same learning rates.
@@ -298,13 +363,17 @@ impl TrainConfig {
         check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
         let beside = self.renew.is_empty() || self.weights.is_some();
         check(beside, "renew", self.renew.join(", "), "only with weights: without them all layers begin anew")?;
-        match (&self.noise, &self.iterates) {
-            (Some(NoiseConfig { sigma: [low, high] }), None) => {
+        let unfolds = matches!(self.network, NetworkConfig::Unfolding { .. });
+        let legal = "[snapshots] for an unfolding network, and for no other";
+        check(unfolds == self.snapshots.is_some(), "snapshots", "left out, or of another network", legal)?;
+        match (&self.noise, &self.iterates, &self.snapshots) {
+            (Some(NoiseConfig { sigma: [low, high] }), None, None) => {
                 let ordered = level(*low) && level(*high) && low <= high;
                 check(ordered, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
             }
-            (None, Some(iterates)) => self.validate_iterates(iterates)?,
-            _ => check(false, "noise", "noise and iterates", "one of the two tables, [noise] or [iterates]")?,
+            (None, Some(iterates), None) => self.validate_iterates(iterates)?,
+            (None, None, Some(snapshots)) => self.validate_snapshots(snapshots)?,
+            _ => check(false, "noise", "several", "one of the tables [noise], [iterates] and [snapshots]")?,
         }
         check(training.steps >= 1, "training.steps", training.steps, "at least 1")?;
         let rate = training.learning_rate;
@@ -352,6 +421,28 @@ impl TrainConfig {
         check(density, "iterates.density", format_args!("[{thin}, {dense}]"), legal)?;
         check((0.0..=0.5).contains(holes), "iterates.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(gray_masks), "iterates.gray_masks", gray_masks, "0 to 1")
+    }
+
+    fn validate_snapshots(&self, snapshots: &SnapshotsConfig) -> Result<()> {
+        let SnapshotsConfig { frames: [few, many], density: [thin, dense], .. } = snapshots;
+        let SnapshotsConfig { masks, noise, holes, saturated, mask_errors, .. } = snapshots;
+        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: snapshots.frames says how many")?;
+        check(self.data.patch.is_multiple_of(8), "data.patch", self.data.patch, "a multiple of 8")?;
+        let frames = (1..=64).contains(few) && (*few..=64).contains(many);
+        check(
+            frames,
+            "snapshots.frames",
+            format_args!("[{few}, {many}]"),
+            "two numbers from 1 to 64, the lower first",
+        )?;
+        let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
+        let legal = "two shares above 0 and at most 1, the lower first";
+        check(density, "snapshots.density", format_args!("[{thin}, {dense}]"), legal)?;
+        check(!masks.is_empty(), "snapshots.masks", "none", "at least one kind")?;
+        check(level(*noise), "snapshots.noise", noise, LEVELS)?;
+        check((0.0..=0.5).contains(holes), "snapshots.holes", holes, "0 to 0.5")?;
+        check((0.0..=1.0).contains(saturated), "snapshots.saturated", saturated, "0 to 1")?;
+        check((0.0..=1.0).contains(mask_errors), "snapshots.mask_errors", mask_errors, "0 to 1")
     }
 
     /// Whether a layer, or a variable of one, begins anew.

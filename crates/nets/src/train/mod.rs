@@ -11,14 +11,15 @@ mod iterates;
 mod muon;
 mod noise;
 mod revive;
+mod snapshots;
 mod step;
 mod unrolled;
 
 pub use crate::kernels::Precision;
 pub use adam::Adam;
 pub use config::{
-    CheckpointConfig, DataConfig, IteratesConfig, Loss, NetworkConfig, NoiseConfig, Optimizer, TrainConfig,
-    TrainingConfig, ValidationConfig,
+    CheckpointConfig, DataConfig, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig, Optimizer,
+    SnapshotsConfig, TrainConfig, TrainingConfig, ValidationConfig,
 };
 pub use data::{Frame, TrainData, frame_from_rgb};
 pub use step::{Resumed, Score, StepReport, Trainer};

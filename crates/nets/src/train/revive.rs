@@ -151,7 +151,7 @@ fn replace(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Ffdnet, Network};
+    use crate::{Ffdnet, Layers, Network};
     use candle_core::{Device, Var};
     use rand::SeedableRng;
 

@@ -3,16 +3,20 @@
 use super::adam::Adam;
 use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
-use super::config::{IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
+use super::config::{
+    IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, SnapshotsConfig, TrainConfig, TrainingConfig,
+};
 use super::data::{TrainData, to_video};
 use super::iterates::{RecordedCall, Simulated};
 use super::noise::{add_noise, sensor};
 use super::revive::{Idle, State};
+use super::snapshots::{Exercise, cut};
 use super::unrolled::Unrolled;
 use crate::kernels::with_numbers;
 use crate::layers::Conv;
+use crate::unfolding::{MULTIPLE, UnfoldingNet};
 use crate::weights::{Storage, write_safetensors};
-use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Network, Result};
+use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result};
 use admm::{Call, Denoiser, Flips};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
@@ -63,6 +67,7 @@ enum Model {
     Ffdnet(Ffdnet),
     Fastdvdnet(Fastdvdnet),
     Ddnet(Ddnet),
+    Unfolding(UnfoldingNet),
 }
 
 impl Model {
@@ -77,22 +82,46 @@ impl Model {
             NetworkConfig::Ddnet { widths, ends } => {
                 Self::Ddnet(Ddnet::random(NetworkConfig::ddnet(widths), ends, seed)?)
             }
+            NetworkConfig::Unfolding { channels, iterations, widths, depth } => {
+                let spec = NetworkConfig::unfolding(channels, iterations, widths, depth);
+                Self::Unfolding(UnfoldingNet::random(spec, seed)?)
+            }
         })
     }
 
-    fn network(&self) -> &dyn Network {
+    fn layers(&self) -> &dyn Layers {
         match self {
             Self::Ffdnet(net) => net,
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
+            Self::Unfolding(net) => net,
         }
     }
 
-    fn network_mut(&mut self) -> &mut dyn Network {
+    fn layers_mut(&mut self) -> &mut dyn Layers {
         match self {
             Self::Ffdnet(net) => net,
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
+            Self::Unfolding(net) => net,
+        }
+    }
+
+    /// The network of frames.
+    fn network(&self) -> Result<&dyn Network> {
+        match self {
+            Self::Ffdnet(net) => Ok(net),
+            Self::Fastdvdnet(net) => Ok(net),
+            Self::Ddnet(net) => Ok(net),
+            Self::Unfolding(net) => Err(takes_no_frames(net)),
+        }
+    }
+
+    /// The network of measurements.
+    fn unfolding(&self) -> Result<&UnfoldingNet> {
+        match self {
+            Self::Unfolding(net) => Ok(net),
+            other => Err(Error::Data(format!("{} takes frames, not measurements", other.layers().describe()))),
         }
     }
 
@@ -109,6 +138,10 @@ impl Model {
     }
 }
 
+fn takes_no_frames(net: &UnfoldingNet) -> Error {
+    Error::Data(format!("{} takes measurements, not frames", net.describe()))
+}
+
 /// Clean clips, what the network sees of them (both `[clips · T, C, P, P]`), σ of each.
 struct Batch {
     clean: Tensor,
@@ -122,6 +155,8 @@ enum Lesson {
     Batch(Batch),
     /// Some iterations of a solver.
     Unrolled(Box<Unrolled>),
+    /// The whole solve of a measurement.
+    Exercise(Box<Exercise>),
 }
 
 /// A loss, and its gradient for each variable (nothing for those it does not depend on).
@@ -210,6 +245,8 @@ const VALIDATION_STREAM: u64 = 1 << 63;
 /// Frames and largest side of the clips that are reconstructed to validate.
 const VALIDATION_FRAMES: usize = 8;
 const VALIDATION_SIDE: usize = 256;
+/// Noise on measurements that are solved to validate, in 0..255 units.
+const NOISE_LEVELS: [Option<f32>; 2] = [None, Some(25.0)];
 
 impl Denoiser for Model {
     fn name(&self) -> &str {
@@ -226,6 +263,7 @@ impl Denoiser for Model {
             Self::Ffdnet(net) => net.denoise(call, noisy, out),
             Self::Fastdvdnet(net) => net.denoise(call, noisy, out),
             Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
+            Self::Unfolding(net) => Err(Box::new(takes_no_frames(net))),
         }
     }
 }
@@ -239,12 +277,12 @@ impl Trainer {
         config.validate()?;
         data.check(config.network.channels(), config.data.photo_share)?;
         let mut model = Model::random(&config.network, config.seed)?;
-        model.network_mut().set_precision(config.training.precision);
-        let vars = model.network_mut().make_trainable()?;
+        model.layers_mut().set_precision(config.training.precision);
+        let vars = model.layers_mut().make_trainable()?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
-        let idle = Idle::new(&model.network().convs(), &vars);
+        let idle = Idle::new(&model.layers().convs(), &vars);
         Ok(Self { config, data, model, vars, adam, average, idle, random: true, step: 0 })
     }
 
@@ -253,16 +291,16 @@ impl Trainer {
     /// # Errors
     /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
     pub fn start_from(&mut self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
-        let random = self.model.network().state();
+        let random = self.model.layers().state();
         if let Some(part) = self.config.renew.iter().find(|part| !random.keys().any(|name| name.contains(&***part))) {
             let legal = "parts of the names of the network's layers".to_owned();
             return Err(Error::Setting { key: "renew", value: part.clone(), legal });
         }
-        self.model.network_mut().set_state(weights)?;
+        self.model.layers_mut().set_state(weights)?;
         let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
-        let state = self.model.network().state().into_iter().chain(renewed).collect();
-        self.model.network_mut().set_state(&state)?;
-        self.vars = self.model.network_mut().make_trainable()?;
+        let state = self.model.layers().state().into_iter().chain(renewed).collect();
+        self.model.layers_mut().set_state(&state)?;
+        self.vars = self.model.layers_mut().make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         self.random = false;
@@ -276,12 +314,12 @@ impl Trainer {
 
     /// What is trained, with its size.
     pub fn describe(&self) -> String {
-        self.model.network().describe()
+        self.model.layers().describe()
     }
 
     /// Number of trained values.
     pub fn parameter_count(&self) -> usize {
-        self.model.network().parameter_count()
+        self.model.layers().parameter_count()
     }
 
     /// Steps done.
@@ -323,7 +361,7 @@ impl Trainer {
     fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
         let now = self.vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor()));
         let mut model = self.frozen(now.collect());
-        model.network_mut().set_inference_precision(self.config.training.precision);
+        model.layers_mut().set_inference_precision(self.config.training.precision);
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
         let clip = |seed: u64| {
             let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
@@ -347,7 +385,20 @@ impl Trainer {
         Ok(clips.into_iter().flatten().collect())
     }
 
-    /// One update, by a new batch of noisy clips or by iterates of a solver.
+    /// Clips measured by simulated cameras, each a lesson of its own as they differ in length.
+    fn exercises(&self, settings: &SnapshotsConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
+        let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
+        let exercise = |seed: u64| {
+            let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
+            let [few, many] = settings.frames;
+            let frames = rng.random_range(few..=many);
+            let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
+            Ok(Lesson::Exercise(Box::new(Exercise::new(clip.view(), settings, &mut rng)?)))
+        };
+        seeds.into_par_iter().map(exercise).collect()
+    }
+
+    /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves.
     ///
     /// # Errors
     /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the step.
@@ -358,10 +409,11 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.config.learning_rate(self.step);
-        let lessons = match self.config.iterates.clone() {
-            Some(iterates) => self.iterates(&iterates, &mut rng)?,
-            None => {
-                let noise = self.config.noise.clone().expect("validated: noise or iterates");
+        let lessons = match (&self.config.iterates, &self.config.snapshots) {
+            (Some(iterates), _) => self.iterates(iterates, &mut rng)?,
+            (_, Some(snapshots)) => self.exercises(snapshots, &mut rng)?,
+            _ => {
+                let noise = self.config.noise.clone().expect("validated: noise, iterates or snapshots");
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
@@ -395,7 +447,7 @@ impl Trainer {
             }
             let renewed = !self.random;
             let watched = self.watched(lesson)?;
-            let conv = watched.network().convs()[i];
+            let conv = watched.layers().convs()[i];
             let Some(means) = conv.input_means() else { continue };
             open(conv, means, self.variables(weight, bias), renewed)?;
         }
@@ -406,7 +458,7 @@ impl Trainer {
     /// What each layer is given on average, from what a lesson begins with, and what follows from it.
     fn find_centres(&mut self, lesson: &Lesson) -> Result<()> {
         let watched = self.watched(lesson)?;
-        let convs = watched.network().convs();
+        let convs = watched.layers().convs();
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
             let Some(means) = convs[i].input_means() else { continue };
             // What a ReLU lets through is what the next layer is given.
@@ -431,14 +483,15 @@ impl Trainer {
     /// The model after a pass of what a lesson begins with, in which it noted the means.
     fn watched(&self, lesson: &Lesson) -> Result<Model> {
         let mut watched = self.model.clone();
-        watched.network_mut().convs_mut().into_iter().for_each(Conv::watch);
+        watched.layers_mut().convs_mut().into_iter().for_each(Conv::watch);
         match lesson {
-            Lesson::Batch(Batch { seen, sigmas, .. }) => watched.network().forward(seen, sigmas)?,
+            Lesson::Batch(Batch { seen, sigmas, .. }) => drop(watched.network()?.forward(seen, sigmas)?),
             Lesson::Unrolled(unrolled) => {
                 let first = &unrolled.calls[0];
-                watched.network().forward(&tensor(first.input.clone())?, &[first.sigma])?
+                drop(watched.network()?.forward(&tensor(first.input.clone())?, &[first.sigma])?);
             }
-        };
+            Lesson::Exercise(exercise) => drop(watched.unfolding()?.unfold(exercise.snapshot())?),
+        }
         Ok(watched)
     }
 
@@ -462,11 +515,12 @@ impl Trainer {
     }
 
     fn gradient(&self, lesson: &Lesson) -> Result<Gradients> {
-        let (network, loss) = (self.model.network(), self.config.training.loss);
+        let loss = self.config.training.loss;
         match lesson {
-            Lesson::Unrolled(unrolled) => unrolled.gradient(network, &self.vars, loss),
+            Lesson::Unrolled(unrolled) => unrolled.gradient(self.model.network()?, &self.vars, loss),
+            Lesson::Exercise(exercise) => exercise.gradient(self.model.unfolding()?, &self.vars, loss),
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
-                let loss = loss.mean(&(network.forward(seen, sigmas)? - clean)?)?;
+                let loss = loss.mean(&(self.model.network()?.forward(seen, sigmas)? - clean)?)?;
                 let mut found = Gradients::zero(self.vars.len());
                 found.add_found(loss.to_scalar()?, &loss.backward()?, &self.vars)?;
                 Ok(found)
@@ -491,7 +545,7 @@ impl Trainer {
     /// # Errors
     /// When a tensor operation fails.
     pub fn weights(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut state = self.model.network().state();
+        let mut state = self.model.layers().state();
         for ((name, var), average) in self.vars.iter().zip(&self.average) {
             state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
         }
@@ -515,6 +569,9 @@ impl Trainer {
         let mut model = self.frozen(self.weights()?);
         if let Some(iterates) = &self.config.iterates {
             return Ok(vec![self.score_reconstruction(&mut model, iterates)?]);
+        }
+        if let Model::Unfolding(net) = &model {
+            return NOISE_LEVELS.into_iter().map(|sigma| self.score_solves(net, sigma)).collect();
         }
         let settings = &self.config.validation;
         let mut scores = Vec::new();
@@ -552,10 +609,24 @@ impl Trainer {
         Ok(Score { sigma: None, psnr_db: sum / f64::from(count) })
     }
 
+    /// PSNR of the solves of the middle of each held-out clip, without noise on the measurement or with that of a level in 0..255 units.
+    fn score_solves(&self, net: &UnfoldingNet, sigma: Option<f32>) -> Result<Score> {
+        let mut psnrs = Vec::new();
+        for (i, clip) in self.data.validation.iter().enumerate() {
+            let mut rng = self.rng(VALIDATION_STREAM + i as u64);
+            let clean = cut(&centre(&to_video(clip, VALIDATION_FRAMES)), MULTIPLE);
+            let exercise = Exercise::plain(clean.view(), sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
+            let results = net.unfold(exercise.snapshot())?;
+            let errors = results.last().map(|last| exercise.errors(last)).transpose()?.unwrap_or_default();
+            psnrs.extend(errors.into_iter().map(|error| -10.0 * f64::from(error).log10()));
+        }
+        Ok(Score { sigma, psnr_db: psnrs.iter().sum::<f64>() / psnrs.len() as f64 })
+    }
+
     /// The model with these weights, for inference: constants are packed for the kernels once, not at each call.
     fn frozen(&self, mut weights: BTreeMap<String, Tensor>) -> Model {
         let mut model = self.model.clone();
-        for conv in model.network_mut().convs_mut() {
+        for conv in model.layers_mut().convs_mut() {
             for (name, tensor, _) in conv.tensors_mut() {
                 if let Some(weight) = weights.remove(&name) {
                     *tensor = weight;

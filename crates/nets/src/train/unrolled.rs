@@ -98,7 +98,7 @@ fn through_projection(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec};
+    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers};
     use admm::Denoiser;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;

@@ -5,7 +5,10 @@
 mod bundled;
 mod pth;
 
-use crate::{Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Network, Result};
+use crate::{
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, UnfoldingNet,
+    UnfoldingSpec,
+};
 use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,6 +25,8 @@ pub enum Architecture {
     Fastdvdnet(FastdvdnetSpec),
     /// DDNet.
     Ddnet(DdnetSpec),
+    /// The unfolding network, gray or color.
+    Unfolding(UnfoldingSpec),
 }
 
 impl std::fmt::Display for Architecture {
@@ -30,6 +35,7 @@ impl std::fmt::Display for Architecture {
             Self::Ffdnet(spec) => spec.fmt(f),
             Self::Fastdvdnet(spec) => spec.fmt(f),
             Self::Ddnet(spec) => spec.fmt(f),
+            Self::Unfolding(spec) => spec.fmt(f),
         }
     }
 }
@@ -114,8 +120,9 @@ impl WeightFile {
     /// # Errors
     /// [`Error::UnknownArchitecture`].
     pub fn architecture(&self) -> Result<Architecture> {
-        FastdvdnetSpec::recognise(self)
-            .map(Architecture::Fastdvdnet)
+        UnfoldingSpec::recognise(self)
+            .map(Architecture::Unfolding)
+            .or_else(|| FastdvdnetSpec::recognise(self).map(Architecture::Fastdvdnet))
             .or_else(|| DdnetSpec::recognise(self).map(Architecture::Ddnet))
             .or_else(|| FfdnetSpec::recognise(self).map(Architecture::Ffdnet))
             .ok_or_else(|| Error::UnknownArchitecture {
@@ -157,11 +164,12 @@ impl WeightFile {
 ///
 /// # Errors
 /// When the file is of no known network, or its tensors do not fit together.
-pub fn network(file: WeightFile) -> Result<Box<dyn Network>> {
+pub fn network(file: WeightFile) -> Result<Box<dyn Layers>> {
     Ok(match file.architecture()? {
         Architecture::Ffdnet(_) => Box::new(Ffdnet::from_weights(file)?),
         Architecture::Fastdvdnet(_) => Box::new(Fastdvdnet::from_weights(file, Ends::Circular)?),
         Architecture::Ddnet(_) => Box::new(Ddnet::from_weights(file, Ends::Circular)?),
+        Architecture::Unfolding(_) => Box::new(UnfoldingNet::from_weights(file)?),
     })
 }
 

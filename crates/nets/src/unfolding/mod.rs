@@ -1,0 +1,780 @@
+//! The deep unfolding network: a prior that knows the measurement. A few iterations of projection onto the measurement and a
+//! small U-shaped network in turn, trained as one.
+//!
+//! ```text
+//! x₀ = y / Σ_t C_t in every frame
+//! v_k, h_k = network_k(x_k, x_k − v_{k−1}, h_{k−1};  y / Σ C, C_t, Σ C),      x_{k+1} = v_k + Hᵀ (y − H v_k) / Σ_t C_t²
+//! ```
+//!
+//! Everything is at half the size, each 2×2 pixels as channels (the *phases* of an image); the network adds to its estimate, and
+//! begins silent, so that the untrained solve is plain projection. Features `h` go from each iteration to the next. Frames are
+//! mixed at no cost: in each residual block a share of the channels is taken from the frame before, and as much from the frame after
+//! (zeros beyond the ends), so that any number of frames goes through. Color frames leave the network as RGB, though it is shown the mosaic
+//! alone: there is no demosaicing beside it.
+//!
+//! # References
+//! Zhang, Ghanem, *ISTA-Net*, CVPR 2018, and Meng, Jalali, Yuan, *GAP-net for snapshot compressive imaging*, 2020 (unfolding); Zhang, Zuo, Zhang,
+//! *FFDNet*, TIP 2018 (half size by pixels as channels); Lin, Gan, Han, *TSM: temporal shift module*, ICCV 2019; Qi et al., *Real-time
+//! streaming video denoising with bidirectional buffers*, ACM MM 2022 (the shift in video restoration).
+
+mod temporal_shift;
+#[cfg(test)]
+mod tests;
+
+use temporal_shift::TemporalShift;
+
+use crate::infer::{Cache, Engine, channel_row, set_channel};
+use crate::kernels::{Blocked, Conv3x3, LANES};
+use crate::layers::{Conv, Shift, Source, chain};
+use crate::network::{Layers, reflect};
+use crate::weights::{Architecture, WeightFile};
+use crate::{Error, Result};
+use admm::{Call, Estimate, Prior, PriorError};
+use candle_core::{Device, Tensor};
+use candle_nn::ops::pixel_shuffle;
+use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView3, Axis, Zip};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use sci_forward::CfaPattern;
+
+/// Sizes at which the U-shaped network works: a half, a quarter and an eighth.
+const LEVELS: usize = 3;
+/// Sides of an image are continued to a multiple of this.
+pub(crate) const MULTIPLE: usize = 2 << (LEVELS - 1);
+/// One of so many channels is taken from the frame before, and one from the frame after.
+const SHIFTED: usize = 4;
+/// Phases of an image of one channel.
+const PHASES: usize = 4;
+/// Images beside the estimate that the network is shown: what the projection changed, y / Σ C, the mask, Σ C, and y / Σ C behind the mask.
+const BESIDE: usize = 5;
+/// Where an RGGB sensor samples the phases `[3 · 4]` of an RGB frame.
+const SITES: [usize; PHASES] = [0, 5, 6, 11];
+
+/// The size of an [`UnfoldingNet`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct UnfoldingSpec {
+    /// Colors of a frame: 1, or 3 for an RGB video behind a Bayer sensor.
+    pub channels: usize,
+    /// Iterations, each with weights of its own: 1 to 32.
+    pub iterations: usize,
+    /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
+    pub widths: [usize; LEVELS],
+    /// Residual blocks at an eighth of the size; there are two at the other sizes. 1 to 16.
+    pub depth: usize,
+}
+
+impl UnfoldingSpec {
+    pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
+        let outputs = |name: &str| file.shape(&format!("iteration0.{name}.weight"))?.first().copied();
+        let channels = outputs("output")? / PHASES;
+        let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
+        let iterations = (0..).take_while(|k| file.shape(&format!("iteration{k}.input.weight")).is_some()).count();
+        let blocks = (0..).take_while(|b| file.shape(&format!("iteration0.block{b}.0.weight")).is_some()).count();
+        Some(Self { channels, iterations, widths, depth: blocks.checked_sub(2 * (LEVELS - 1))? })
+    }
+
+    fn validate(self) -> Result<Self> {
+        let bad =
+            |key, value: usize, legal: &str| Err(Error::Setting { key, value: value.to_string(), legal: legal.into() });
+        let width = |w: &usize| !(16..=512).contains(w) || !w.is_multiple_of(16);
+        match self {
+            Self { channels, .. } if channels != 1 && channels != 3 => bad("channels", channels, "1 (gray) or 3 (RGB)"),
+            Self { iterations, .. } if !(1..=32).contains(&iterations) => bad("iterations", iterations, "1 to 32"),
+            Self { depth, .. } if !(1..=16).contains(&depth) => bad("depth", depth, "1 to 16"),
+            Self { widths, .. } => match widths.into_iter().find(width) {
+                Some(wrong) => bad("widths", wrong, "multiples of 16 from 16 to 512"),
+                None => Ok(self),
+            },
+        }
+    }
+
+    /// What is done between the first and the last convolution of an iteration.
+    fn steps(self) -> Vec<Step> {
+        let down = (0..LEVELS - 1).flat_map(|level| [Step::Block(level), Step::Down(level)]);
+        let deepest = std::iter::repeat_n(Step::Block(LEVELS - 1), self.depth);
+        let up = (0..LEVELS - 1).rev().flat_map(|level| [Step::Up(level), Step::Block(level)]);
+        down.chain(deepest).chain(up).collect()
+    }
+
+    /// Channels that the network is shown, and those that it finds.
+    fn ends(self) -> (usize, usize) {
+        (PHASES * (self.channels + BESIDE), PHASES * self.channels)
+    }
+
+    /// Name, channels, stride, ReLU, bias and silence of the layers of an iteration, in the order in which they are done.
+    fn layers(self) -> Vec<LayerSpec> {
+        let (w, (shown, found)) = (self.widths, self.ends());
+        let plain = |name: &str, inputs, outputs| LayerSpec::new(name.to_owned(), inputs, outputs);
+        let mut layers = vec![plain("input", shown, w[0])];
+        let mut blocks = 0;
+        for step in self.steps() {
+            match step {
+                Step::Block(level) => {
+                    let name = |i: usize| format!("block{blocks}.{i}");
+                    layers.push(LayerSpec { relu: true, ..LayerSpec::new(name(0), w[level], w[level]) });
+                    layers.push(LayerSpec { silent: true, ..LayerSpec::new(name(1), w[level], w[level]) });
+                    blocks += 1;
+                }
+                Step::Down(level) => {
+                    let down = plain(&format!("down{level}"), w[level], w[level + 1]);
+                    layers.push(LayerSpec { stride: 2, relu: true, ..down });
+                }
+                Step::Up(level) => {
+                    let up = plain(&format!("up{level}"), w[level + 1], PHASES * w[level]);
+                    layers.push(LayerSpec { silent: true, bias: false, ..up });
+                }
+            }
+        }
+        layers.push(LayerSpec { silent: true, ..plain("output", w[0], found) });
+        layers
+    }
+
+    /// Multiply-adds for each pixel of each frame, over all iterations.
+    pub fn multiply_adds(self) -> f64 {
+        let mut pixels = 1.0 / PHASES as f64;
+        let mut sum = 0.0;
+        for layer in self.layers() {
+            pixels /= (layer.stride * layer.stride) as f64;
+            sum += pixels * (9 * layer.inputs * layer.outputs) as f64;
+            if layer.name.starts_with("up") {
+                pixels *= PHASES as f64;
+            }
+        }
+        sum * self.iterations as f64
+    }
+}
+
+impl std::fmt::Display for UnfoldingSpec {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let colors = if self.channels == 1 { "gray" } else { "color" };
+        let ([a, b, c], n) = (self.widths, self.iterations);
+        write!(f, "unfolding network ({colors}, {n} iterations, {a}/{b}/{c} channels, depth {})", self.depth)
+    }
+}
+
+/// A part of an iteration; its level is 0 at half the size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    /// Residual block: `h + conv(relu(conv(shift(h))))`.
+    Block(usize),
+    /// To the next level.
+    Down(usize),
+    /// Back from it, added to what was there.
+    Up(usize),
+}
+
+/// A convolution.
+struct LayerSpec {
+    name: String,
+    inputs: usize,
+    outputs: usize,
+    stride: usize,
+    relu: bool,
+    bias: bool,
+    /// It begins as zero: what it is added to is right already.
+    silent: bool,
+}
+
+impl LayerSpec {
+    fn new(name: String, inputs: usize, outputs: usize) -> Self {
+        Self { name, inputs, outputs, stride: 1, relu: false, bias: true, silent: false }
+    }
+}
+
+/// A measurement as the network is shown it. Scaling masks and measurement together changes nothing.
+#[derive(Debug, Clone)]
+pub(crate) struct Shown {
+    /// y / Σ_t C_t `[H, W]`; ½ where no mask is open.
+    pub(crate) mean: Array2<f32>,
+    /// C_t `[T, H, W]` by √2 times the root of their mean square: binary masks of density ½ keep their values.
+    pub(crate) masks: Array3<f32>,
+    /// The mean of those over time `[H, W]`.
+    pub(crate) open: Array2<f32>,
+}
+
+impl Shown {
+    pub(crate) fn new(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Self {
+        let squares: f64 = masks.iter().map(|&c| f64::from(c) * f64::from(c)).sum();
+        let scale = (2.0 * squares / masks.len().max(1) as f64).sqrt().max(f64::MIN_POSITIVE) as f32;
+        let sum = masks.sum_axis(Axis(0));
+        let mean = Zip::from(y).and(&sum).map_collect(|&y, &sum| if sum > 0.0 { y / sum } else { GRAY });
+        let masks = masks.mapv(|c| c / scale);
+        let open = sum / (scale * masks.len_of(Axis(0)) as f32);
+        Self { mean, masks, open }
+    }
+}
+
+/// The middle of the range of frames, which is taken off what the network is shown.
+const GRAY: f32 = 0.5;
+
+/// The network.
+#[derive(Debug, Clone)]
+pub struct UnfoldingNet {
+    spec: UnfoldingSpec,
+    /// Of all iterations, in the order in which they are done.
+    convs: Vec<Conv>,
+    cache: Cache,
+}
+
+impl UnfoldingNet {
+    /// Takes the weights of a file that has been read.
+    ///
+    /// # Errors
+    /// When the weights are of another network, or do not fit together.
+    pub fn from_weights(file: WeightFile) -> Result<Self> {
+        match file.architecture()? {
+            Architecture::Unfolding(spec) => {
+                let path = file.path().to_owned();
+                let mut source = Source::stored(file.into_tensors());
+                let net = Self::build(spec.validate()?, &mut source)?;
+                source.finish(&path, &spec.to_string())?;
+                Ok(net)
+            }
+            other => Err(Error::wrong_architecture(file.path(), "the unfolding network", other)),
+        }
+    }
+
+    /// An untrained network, the same for the same seed; its result is its input.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for a size out of range.
+    pub fn random(spec: UnfoldingSpec, seed: u64) -> Result<Self> {
+        let mut net = Self::build(spec.validate()?, &mut Source::Random(&mut ChaCha8Rng::seed_from_u64(seed)))?;
+        let layers = spec.layers();
+        for (conv, layer) in net.convs.iter_mut().zip(layers.iter().cycle()) {
+            if layer.silent {
+                conv.silence()?;
+            }
+        }
+        Ok(net)
+    }
+
+    fn build(spec: UnfoldingSpec, source: &mut Source<'_>) -> Result<Self> {
+        let mut convs = Vec::new();
+        for k in 0..spec.iterations {
+            for LayerSpec { name, inputs, outputs, stride, relu, bias, .. } in spec.layers() {
+                let opts = Conv3x3 { stride, relu, ..Conv3x3::default() };
+                let shift = if bias { Shift::Bias } else { Shift::Nothing };
+                convs.push(Conv::new(source, format!("iteration{k}.{name}"), (inputs, outputs), opts, shift)?);
+            }
+        }
+        Ok(Self { spec, convs, cache: Cache::default() })
+    }
+
+    /// Its size.
+    pub fn spec(&self) -> UnfoldingSpec {
+        self.spec
+    }
+
+    /// The solve as a differentiable function of the weights: the result of each iteration, all as phases `[T, 4 C, H/2, W/2]`.
+    pub(crate) fn unfold(&self, snapshot: &Snapshot) -> Result<Vec<Tensor>> {
+        let mut results: Vec<Tensor> = Vec::new();
+        let (mut x, mut sensor, mut features) = (snapshot.start.clone(), snapshot.start.clone(), None);
+        for k in 0..self.spec.iterations {
+            let base = self.base(&x, results.last())?;
+            let changed = (&x - &sensor)?;
+            let shown = Tensor::cat(&[&(&base - f64::from(GRAY))?, &changed, &snapshot.beside], 1)?;
+            let (found, h) = self.iteration(k, &shown, features.take())?;
+            let v = (base + found)?;
+            sensor = self.sensor(&v)?;
+            x = snapshot.project(&sensor)?;
+            features = Some(h);
+            results.push(v);
+        }
+        Ok(results)
+    }
+
+    /// One call of the network: what it adds to the estimate, and the features for the next.
+    fn iteration(&self, k: usize, shown: &Tensor, features: Option<Tensor>) -> candle_core::Result<(Tensor, Tensor)> {
+        let each = self.convs.len() / self.spec.iterations;
+        let convs = &self.convs[k * each..][..each];
+        let mut next = 0;
+        let mut layers = |count: usize| {
+            next += count;
+            &convs[next - count..next]
+        };
+        let h = chain(layers(1), &[], shown)?;
+        let mut h = match features {
+            Some(features) => (features + h)?,
+            None => h,
+        };
+        let mut above = Vec::new();
+        for step in self.spec.steps() {
+            h = match step {
+                Step::Block(_) => {
+                    let shifted = h.apply_op1(TemporalShift::of(h.dim(1)?))?;
+                    (&h + chain(layers(2), &[], &shifted)?)?
+                }
+                Step::Down(_) => {
+                    let down = chain(layers(1), &[], &h)?;
+                    above.push(std::mem::replace(&mut h, down.clone()));
+                    down
+                }
+                Step::Up(_) => {
+                    let up = pixel_shuffle(&chain(layers(1), &[], &h)?, 2)?;
+                    match above.pop() {
+                        Some(above) => (above + up)?,
+                        None => up,
+                    }
+                }
+            };
+        }
+        Ok((chain(layers(1), &[], &h)?, h))
+    }
+
+    /// What the network adds to: the iterate, in color the last result with the iterate where the sensor samples it; at first
+    /// the nearest samples of each color.
+    fn base(&self, x: &Tensor, last: Option<&Tensor>) -> candle_core::Result<Tensor> {
+        if self.spec.channels == 1 {
+            return Ok(x.clone());
+        }
+        let [r, g, h, b] = [0, 1, 2, 3].map(|phase| x.narrow(1, phase, 1));
+        let (r, g, h, b) = (r?, g?, h?, b?);
+        match last {
+            None => {
+                let mean = ((&g + &h)? * 0.5)?;
+                Tensor::cat(&[&r, &r, &r, &r, &mean, &g, &h, &mean, &b, &b, &b, &b], 1)
+            }
+            Some(v) => Tensor::cat(&[&r, &v.narrow(1, 1, 4)?, &g, &h, &v.narrow(1, 7, 4)?, &b], 1),
+        }
+    }
+
+    /// What the sensor sees of frames.
+    fn sensor(&self, v: &Tensor) -> candle_core::Result<Tensor> {
+        if self.spec.channels == 1 {
+            return Ok(v.clone());
+        }
+        let sites = SITES.map(|site| v.narrow(1, site, 1)).into_iter().collect::<candle_core::Result<Vec<_>>>()?;
+        Tensor::cat(&sites, 1)
+    }
+}
+
+impl Layers for UnfoldingNet {
+    fn describe(&self) -> String {
+        self.spec.to_string()
+    }
+
+    fn channels(&self) -> usize {
+        self.spec.channels
+    }
+
+    fn convs(&self) -> Vec<&Conv> {
+        self.convs.iter().collect()
+    }
+
+    fn convs_mut(&mut self) -> Vec<&mut Conv> {
+        self.cache.forget();
+        self.convs.iter_mut().collect()
+    }
+}
+
+/// A solve in progress: the measurement, and what the network keeps from iteration to iteration.
+#[derive(Debug)]
+pub struct Unfolding {
+    shown: Shown,
+    lattice: Lattice,
+    /// The last result `[T, C, H, W]`; before the first, `C` times y / Σ C in each frame.
+    last: Array4<f32>,
+    /// Of each frame, at half the size.
+    features: Vec<Blocked>,
+    iteration: usize,
+}
+
+impl Unfolding {
+    /// The last result `[T, C, H, W]`.
+    pub fn frames(&self) -> &Array4<f32> {
+        &self.last
+    }
+
+    /// What the sensor sees of a pixel of the last result.
+    fn sensor(&self, t: usize, y: usize, x: usize) -> f32 {
+        self.last[[t, self.lattice.color(y, x).min(self.last.len_of(Axis(1)) - 1), y, x]]
+    }
+
+    /// What the network adds to, from the iterate.
+    fn base(&self, iterate: ArrayView3<'_, f32>) -> Array4<f32> {
+        let at = |t: usize, [y, x]: [usize; 2]| iterate[[t, y, x]];
+        let (lattice, colors) = (&self.lattice, self.last.len_of(Axis(1)));
+        Array4::from_shape_fn(self.last.dim(), |(t, c, y, x)| match self.iteration {
+            _ if colors == 1 || lattice.color(y, x) == c => at(t, [y, x]),
+            0 if c == 1 => 0.5 * (at(t, lattice.beside([y, x], 1)) + at(t, lattice.beside([y, x], 2))),
+            0 => at(t, lattice.beside([y, x], 3 * c / 2)),
+            _ => self.last[[t, c, y, x]],
+        })
+    }
+}
+
+/// How an image lies among its phases: an RGGB sensor's first pixel is a red one, for others a row or column is put before; the sides are
+/// continued to multiples of [`MULTIPLE`]. Mirrored, so that the colors stay what they are.
+#[derive(Debug)]
+struct Lattice {
+    size: [usize; 2],
+    /// Rows and columns put before.
+    before: [usize; 2],
+    /// Which pixel each continued row, and column, is.
+    sources: [Vec<usize>; 2],
+}
+
+impl Lattice {
+    fn new(size: [usize; 2], cfa: Option<CfaPattern>) -> Self {
+        let red =
+            |cfa: CfaPattern| (0..2).flat_map(|y| [[y, 0], [y, 1]]).find(|&[y, x]| cfa.color_at(y, x) as usize == 0);
+        // A red pixel at (1, 1) is at (2, 2) after a row and a column.
+        let before = cfa.and_then(red).unwrap_or([0, 0]);
+        let sources = [0, 1].map(|axis| {
+            let n = (before[axis] + size[axis]).next_multiple_of(MULTIPLE);
+            (0..n).map(|i| reflect(i as isize - before[axis] as isize, size[axis])).collect()
+        });
+        Self { size, before, sources }
+    }
+
+    /// The color that an RGGB sensor has at a pixel.
+    fn color(&self, y: usize, x: usize) -> usize {
+        (y + self.before[0]) % 2 + (x + self.before[1]) % 2
+    }
+
+    /// The pixel of a phase in the quad of a pixel.
+    fn beside(&self, [y, x]: [usize; 2], phase: usize) -> [usize; 2] {
+        let quad = |i: usize, axis: usize, offset: usize| self.sources[axis][(i + self.before[axis]) / 2 * 2 + offset];
+        [quad(y, 0, phase / 2), quad(x, 1, phase % 2)]
+    }
+
+    /// Sides of an image of one phase.
+    fn half(&self) -> [usize; 2] {
+        [0, 1].map(|axis| self.sources[axis].len() / 2)
+    }
+
+    /// Writes an image, pixel by pixel, into the four channels of its phases from `channel`.
+    fn write(&self, image: &mut Blocked, channel: usize, value: impl Fn(usize, usize) -> f32) {
+        for phase in 0..PHASES {
+            let columns = || self.sources[1].iter().skip(phase % 2).step_by(2);
+            set_channel(image, channel + phase, |y| {
+                let y = self.sources[0][2 * y + phase / 2];
+                let value = &value;
+                columns().map(move |&x| value(y, x))
+            });
+        }
+    }
+
+    /// Adds the image in the four channels of its phases from `channel`.
+    fn add(&self, image: &Blocked, channel: usize, mut to: ndarray::ArrayViewMut2<'_, f32>) {
+        let [h, w] = self.size;
+        for (phase, y) in (0..PHASES).flat_map(|phase| (0..self.half()[0]).map(move |y| (phase, y))) {
+            let Some(row) = (2 * y + phase / 2).checked_sub(self.before[0]).filter(|&row| row < h) else { continue };
+            for (x, found) in channel_row(image, channel + phase, y).enumerate() {
+                if let Some(column) = (2 * x + phase % 2).checked_sub(self.before[1]).filter(|&column| column < w) {
+                    to[[row, column]] += found;
+                }
+            }
+        }
+    }
+}
+
+impl UnfoldingNet {
+    /// Begins the solve of a measurement `[H, W]` through masks `[T, H, W]`; the pattern is that of the sensor of a color video, which a network
+    /// for gray does not look at.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] when the sizes differ or are zero, [`Error::Setting`] when a network for color is given no pattern.
+    pub fn begin(
+        &self,
+        masks: ArrayView3<'_, f32>,
+        y: ArrayView2<'_, f32>,
+        cfa: Option<CfaPattern>,
+    ) -> Result<Unfolding> {
+        let (t, h, w) = masks.dim();
+        if y.dim() != (h, w) || masks.is_empty() {
+            let (expected, found) = (vec![h.max(1), w.max(1)], y.shape().to_vec());
+            return Err(Error::Shape { what: "a measurement", expected, found });
+        }
+        if self.spec.channels == 3 && cfa.is_none() {
+            let legal = "given for a network of color".to_owned();
+            return Err(Error::Setting { key: "cfa", value: "none".to_owned(), legal });
+        }
+        let shown = Shown::new(masks, y);
+        let last = Array4::from_shape_fn((t, self.spec.channels, h, w), |(_, _, y, x)| shown.mean[[y, x]]);
+        let lattice = Lattice::new([h, w], cfa.filter(|_| self.spec.channels == 3));
+        Ok(Unfolding { shown, lattice, last, features: Vec::new(), iteration: 0 })
+    }
+
+    /// The next iteration from the iterate `x [T, H, W]`, without gradients; those after the last are done as the last. The result is
+    /// [`Unfolding::frames`].
+    ///
+    /// # Errors
+    /// [`Error::Shape`] when `x` is of another size than the masks.
+    pub fn advance(&mut self, solve: &mut Unfolding, x: ArrayView3<'_, f32>) -> Result<()> {
+        if x.dim() != solve.shown.masks.dim() {
+            let expected = solve.shown.masks.shape().to_vec();
+            return Err(Error::Shape { what: "an iterate", expected, found: x.shape().to_vec() });
+        }
+        let each = self.convs.len() / self.spec.iterations;
+        let first = each * solve.iteration.min(self.spec.iterations - 1);
+        let convs: Vec<&Conv> = self.convs.iter().collect();
+        let (shuffled, plain) = results(self.spec);
+        let engine = self.cache.engine(&convs, &shuffled, &plain)?;
+        let [half_h, half_w] = solve.lattice.half();
+        engine.start(half_h, half_w);
+        let mut base = solve.base(x);
+        let mut features = std::mem::take(&mut solve.features).into_iter();
+        let mut h = Vec::with_capacity(x.len_of(Axis(0)));
+        for t in 0..x.len_of(Axis(0)) {
+            let mut shown = engine.image(self.spec.ends().0, half_h, half_w);
+            show(&mut shown, solve, x, &base, t);
+            let mut begun = engine.conv(first, &shown)?;
+            engine.recycle(shown);
+            if let Some(before) = features.next() {
+                add(&mut begun, &before);
+                engine.recycle(before);
+            }
+            h.push(begun);
+        }
+        let h = between(engine, &self.spec.steps(), first + 1, h)?;
+        for (h, mut frame) in h.iter().zip(base.outer_iter_mut()) {
+            let found = engine.conv(first + each - 1, h)?;
+            frame.outer_iter_mut().enumerate().for_each(|(c, plane)| solve.lattice.add(&found, PHASES * c, plane));
+            engine.recycle(found);
+        }
+        (solve.last, solve.features) = (base, h);
+        solve.iteration += 1;
+        Ok(())
+    }
+}
+
+/// The network as the prior of plain GAP, from `Start::Mean`: one iteration of the network in each of the solver's. A solve that begins anew (iteration
+/// 0) begins with its own measurement.
+#[derive(Debug)]
+pub struct UnfoldingPrior {
+    net: UnfoldingNet,
+    solve: Option<Unfolding>,
+}
+
+impl UnfoldingPrior {
+    /// Around a network.
+    pub fn new(net: UnfoldingNet) -> Self {
+        Self { net, solve: None }
+    }
+
+    /// The network.
+    pub fn network(&self) -> &UnfoldingNet {
+        &self.net
+    }
+
+    fn advance(&mut self, call: &Call<'_>, noisy: ArrayView3<'_, f32>) -> Result<&Unfolding> {
+        let solve = match self.solve.take() {
+            Some(solve) if call.iteration > 0 => solve,
+            _ => {
+                let Some(measurement) = call.measurement else {
+                    let what = format!("{} needs the measurement, which it is not shown here", self.net.describe());
+                    return Err(Error::Data(what));
+                };
+                // What a sensor that sees 1 everywhere passes on: the mask of each frame.
+                let ones = Array2::ones(measurement.y().dim());
+                self.net.begin(
+                    measurement.operator().adjoint(ones.view()).view(),
+                    measurement.y(),
+                    measurement.cfa(),
+                )?
+            }
+        };
+        let solve = self.solve.insert(solve);
+        self.net.advance(solve, noisy)?;
+        Ok(solve)
+    }
+}
+
+impl Prior for UnfoldingPrior {
+    fn apply(
+        &mut self,
+        call: &Call<'_>,
+        noisy: ArrayView3<'_, f32>,
+        out: &mut Estimate,
+    ) -> std::result::Result<(), PriorError> {
+        let failed = |e: Error| PriorError { part: "network", name: "unfolding".to_owned(), source: Box::new(e) };
+        let solve = self.advance(call, noisy).map_err(failed)?;
+        let frames = solve.frames();
+        if frames.len_of(Axis(1)) == 1 {
+            out.rgb = None;
+            out.sensor.assign(&frames.index_axis(Axis(1), 0));
+        } else {
+            let (sensor, rgb) = out.for_rgb();
+            rgb.assign(frames);
+            sensor.indexed_iter_mut().for_each(|((t, y, x), value)| *value = solve.sensor(t, y, x));
+        }
+        Ok(())
+    }
+}
+
+/// Which layers' results are shuffled, and which are held in f32: all but those inside residual blocks.
+fn results(spec: UnfoldingSpec) -> (Vec<usize>, Vec<usize>) {
+    let layers: Vec<LayerSpec> = (0..spec.iterations).flat_map(|_| spec.layers()).collect();
+    let which = |wanted: fn(&LayerSpec) -> bool| {
+        layers.iter().enumerate().filter(|(_, layer)| wanted(layer)).map(|(i, _)| i).collect()
+    };
+    (which(|layer| layer.name.starts_with("up")), which(|layer| !(layer.relu && layer.stride == 1)))
+}
+
+/// Writes what the network is shown of a frame.
+fn show(image: &mut Blocked, solve: &Unfolding, x: ArrayView3<'_, f32>, base: &Array4<f32>, t: usize) {
+    let Unfolding { shown: Shown { mean, masks, open }, lattice, .. } = solve;
+    let colors = base.len_of(Axis(1));
+    for c in 0..colors {
+        lattice.write(image, PHASES * c, |i, j| base[[t, c, i, j]] - GRAY);
+    }
+    let mut next = PHASES * colors;
+    let mut write = |value: &dyn Fn(usize, usize) -> f32| {
+        lattice.write(image, next, value);
+        next += PHASES;
+    };
+    write(&|i, j| x[[t, i, j]] - solve.sensor(t, i, j));
+    write(&|i, j| mean[[i, j]] - GRAY);
+    write(&|i, j| masks[[t, i, j]] - GRAY);
+    write(&|i, j| open[[i, j]] - GRAY);
+    write(&|i, j| (mean[[i, j]] - GRAY) * masks[[t, i, j]]);
+}
+
+/// All of an iteration but its first and last layer, from the layer `next` on, for the features of all frames.
+fn between(engine: &mut Engine, steps: &[Step], mut next: usize, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
+    let mut above: Vec<Vec<Blocked>> = Vec::new();
+    for step in steps {
+        match step {
+            Step::Block(_) => {
+                add_block(engine, next, &mut h)?;
+                next += 2;
+            }
+            Step::Down(_) => {
+                let down = h.iter().map(|h| engine.conv(next, h)).collect::<Result<_>>()?;
+                above.push(std::mem::replace(&mut h, down));
+                next += 1;
+            }
+            Step::Up(_) => {
+                let mut sums = above.pop().unwrap_or_default();
+                for (h, sum) in h.drain(..).zip(&mut sums) {
+                    engine.add_shuffled(next, h, sum)?;
+                }
+                h = sums;
+                next += 1;
+            }
+        }
+    }
+    Ok(h)
+}
+
+/// The residual block of the layers `first` and the one after it, frame by frame.
+fn add_block(engine: &mut Engine, first: usize, h: &mut [Blocked]) -> Result<()> {
+    // The frame before, as it was before the block.
+    let mut before: Option<Blocked> = None;
+    for t in 0..h.len() {
+        let (channels, height, width) = h[t].shape();
+        let mut image = engine.image(channels, height, width);
+        shift(&mut image, before.as_ref(), &h[t], h.get(t + 1));
+        let inside = engine.conv(first, &image)?;
+        let found = engine.conv(first + 1, &inside)?;
+        engine.recycle(inside);
+        sum(&mut image, &h[t], &found);
+        engine.recycle(found);
+        let old = before.replace(std::mem::replace(&mut h[t], image));
+        old.into_iter().for_each(|old| engine.recycle(old));
+    }
+    before.into_iter().for_each(|old| engine.recycle(old));
+    Ok(())
+}
+
+/// [`TemporalShift`] of one frame.
+fn shift(image: &mut Blocked, before: Option<&Blocked>, now: &Blocked, after: Option<&Blocked>) {
+    let each_way = TemporalShift::of(now.shape().0).each_way;
+    for block in 0..image.blocks() {
+        let lanes = |from: usize| {
+            let [from, to] =
+                [from, from + each_way].map(|c| c.clamp(block * LANES, (block + 1) * LANES) - block * LANES);
+            from..to
+        };
+        let ways = [(lanes(0), before), (lanes(each_way), after)];
+        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
+            row.as_flattened_mut().copy_from_slice(now.row(block, y));
+            for (lanes, other) in ways.iter().filter(|(lanes, _)| !lanes.is_empty()) {
+                match other.map(|other| other.row(block, y).as_chunks::<LANES>().0) {
+                    Some(other) => row.iter_mut().zip(other).for_each(|(to, from)| {
+                        to[lanes.clone()].copy_from_slice(&from[lanes.clone()]);
+                    }),
+                    None => row.iter_mut().for_each(|to| to[lanes.clone()].fill(0.0)),
+                }
+            }
+        });
+    }
+}
+
+/// `image = a + b`.
+fn sum(image: &mut Blocked, a: &Blocked, b: &Blocked) {
+    for block in 0..image.blocks() {
+        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
+            let both = a.row(block, y).iter().zip(b.row(block, y));
+            row.as_flattened_mut().iter_mut().zip(both).for_each(|(sum, (a, b))| *sum = a + b);
+        });
+    }
+}
+
+/// `image += other`.
+fn add(image: &mut Blocked, other: &Blocked) {
+    for block in 0..image.blocks() {
+        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
+            row.as_flattened_mut().iter_mut().zip(other.row(block, y)).for_each(|(sum, value)| *sum += value);
+        });
+    }
+}
+
+/// A measurement for [`UnfoldingNet::unfold`], all images as phases `[T or 1, 4, H/2, W/2]`.
+pub(crate) struct Snapshot {
+    masks: Tensor,
+    y: Tensor,
+    /// 1 / Σ C²; 0 where no mask is open.
+    inverse: Tensor,
+    /// y / Σ C in each frame.
+    start: Tensor,
+    /// What the network is shown beside the iterates.
+    beside: Tensor,
+}
+
+impl Snapshot {
+    /// Of masks `[T, H, W]` and a measurement `[H, W]` whose sides are multiples of [`MULTIPLE`], of an RGGB sensor if the network is for
+    /// color.
+    pub(crate) fn new(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<Self> {
+        let shown = Shown::new(masks, y);
+        let frames = masks.len_of(Axis(0));
+        let gram = masks.mapv(|c| c * c).sum_axis(Axis(0));
+        let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / g } else { 0.0 });
+        let image = |image: ArrayView2<'_, f32>| phases(image.insert_axis(Axis(0)));
+        let each = |image: &Tensor| {
+            let (_, c, h, w) = image.dims4()?;
+            image.broadcast_as((frames, c, h, w))?.contiguous()
+        };
+        let start = each(&image(shown.mean.view())?)?;
+        let open = each(&image(shown.open.view())?)?;
+        let masks_shown = phases(shown.masks.view())?;
+        let behind = ((&start - f64::from(GRAY))? * &masks_shown)?;
+        let beside = (Tensor::cat(&[&start, &masks_shown, &open], 1)? - f64::from(GRAY))?;
+        let beside = Tensor::cat(&[&beside, &behind], 1)?;
+        Ok(Self { masks: phases(masks)?, y: image(y)?, inverse: image(inverse.view())?, start, beside })
+    }
+
+    /// `v + Hᵀ (y − H v) / Σ C²`.
+    fn project(&self, v: &Tensor) -> candle_core::Result<Tensor> {
+        let lacks = (&self.y - (v * &self.masks)?.sum_keepdim(0)?)?;
+        v + self.masks.broadcast_mul(&(lacks * &self.inverse)?)?
+    }
+
+    /// In another number type, for tests.
+    #[cfg(test)]
+    fn to_dtype(&self, dtype: candle_core::DType) -> Self {
+        let [masks, y, inverse, start, beside] =
+            [&self.masks, &self.y, &self.inverse, &self.start, &self.beside].map(|t| t.to_dtype(dtype).unwrap());
+        Self { masks, y, inverse, start, beside }
+    }
+}
+
+/// The phases `[N, 4, H/2, W/2]` of images `[N, H, W]` with even sides: pixel `(2y + i, 2x + j)` becomes channel `2i + j`.
+pub(crate) fn phases(images: ArrayView3<'_, f32>) -> Result<Tensor> {
+    let (n, h, w) = images.dim();
+    let all = Tensor::from_iter(images.iter().copied(), &Device::Cpu)?.reshape((n, 1, h, w))?;
+    Ok(candle_nn::ops::pixel_unshuffle(&all, 2)?)
+}
