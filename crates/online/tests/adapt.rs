@@ -3,7 +3,7 @@
 use admm::{BoxError, Call, Denoiser, Flips, Gap, HoldOut, Outcome, Plan, SolveError, Stage, Start, StopReason, run};
 use candle_core::Tensor;
 use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Zip};
-use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, MixedPrecision, Network, WeightFile};
+use nets::{Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, MixedPrecision, Network, WeightFile};
 use online::{
     AdaptConfig, AdaptiveDenoiser, Error, Parameters, Reuse, RollBackReason, RollBackRule, SequenceConfig, Solved,
     Task, UpdateCounts, UpdateOutcome, UpdateSchedule, run_sequence,

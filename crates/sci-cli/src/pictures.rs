@@ -163,6 +163,9 @@ pub fn pngs(video: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, ImageError> {
 }
 
 /// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
+///
+/// # Panics
+/// Never: the frames that are joined again are of one size.
 pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
     let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
     let halved: Vec<_> = frames.par_iter().map(|frame| frames::halved(*frame)).collect();
