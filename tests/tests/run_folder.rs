@@ -179,7 +179,7 @@ fn networks_that_adapt_go_on_as_they_were() {
     let layout = nets::FfdnetLayout::Residual { batch_norm: false };
     let spec = nets::FfdnetSpec { width: 8, depth: 3, layout, ..nets::FfdnetSpec::GRAY };
     let net = nets::Ffdnet::random(spec, 0).unwrap();
-    let mut tensors = nets::Network::state(&net);
+    let mut tensors = nets::Layers::state(&net);
     tensors.values_mut().for_each(|t| *t = t.affine(0.3, 0.0).unwrap());
     nets::weights::write_safetensors(&bench.path("net.safetensors"), &tensors, nets::weights::Storage::F32).unwrap();
     // Some updates are kept and some rolled back, which lowers the learning rate for those that follow.
