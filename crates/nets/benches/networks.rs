@@ -44,6 +44,7 @@ fn training(c: &mut Criterion) {
         renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 75.0] }),
         iterates: None,
+        snapshots: None,
         training: TrainingConfig {
             steps: u64::MAX,
             optimizer: Optimizer::Muon,

@@ -6,8 +6,8 @@ use ndarray::{Array3, Array4, Axis, concatenate, s};
 use nets::kernels::{Isa, Precision};
 use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, MixedPrecision,
-    Network, WeightFile,
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers,
+    MixedPrecision, Network, WeightFile,
 };
 use sci_forward::bayer::{Malvar, mosaic_into};
 use sci_forward::testing::gaussian;
