@@ -212,10 +212,13 @@ pub fn join_gifs(w: &mut impl Write, parts: &[PathBuf]) -> io::Result<()> {
     w.write_all(&[GIF_END])
 }
 
-/// The length of what [`write_gif`] writes before the first frame: header, screen, the palette of a gray video, repetition.
+/// The length of what [`write_gif`] writes before the first frame: header, screen, a palette if the screen has one, repetition.
 fn gif_head(bytes: &[u8]) -> usize {
     const HAS_PALETTE: u8 = 0x80;
-    let palette = if bytes.get(10).is_some_and(|flags| flags & HAS_PALETTE != 0) { 3 * 256 } else { 0 };
+    let palette = match bytes.get(10) {
+        Some(flags) if flags & HAS_PALETTE != 0 => 3 << ((flags & 7) + 1),
+        _ => 0,
+    };
     6 + 7 + palette + 19
 }
 

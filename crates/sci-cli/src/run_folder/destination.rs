@@ -29,11 +29,15 @@ fn real_path(path: &Path) -> PathBuf {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let known = absolute.ancestors().find_map(|a| fs::canonicalize(a).ok().map(|real| (a, real)));
     let Some((ancestor, real)) = known else { return absolute };
-    // An empty rest would end the path with a separator.
-    match absolute.strip_prefix(ancestor) {
-        Ok(rest) if !rest.as_os_str().is_empty() => real.join(rest),
-        _ => real,
-    }
+    let rest = absolute.strip_prefix(ancestor).unwrap_or(Path::new(""));
+    rest.components().fold(real, |mut path, part| {
+        match part {
+            Component::ParentDir => _ = path.pop(),
+            Component::Normal(name) => path.push(name),
+            _ => {}
+        }
+        path
+    })
 }
 
 /// The files that the record of a folder lists, without the record; none where there is no record.
