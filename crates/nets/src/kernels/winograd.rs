@@ -10,7 +10,10 @@ use super::scratch::Slot;
 use super::simd::{LANES, Simd, entry};
 use super::tile::{Out, Run, outer, product};
 use super::{GradStrip, Panel, Strip, Weights};
+use multiversion::multiversion;
 use rayon::prelude::*;
+use std::iter::StepBy;
+use std::slice::IterMut;
 
 /// Interpolation points; see the module header for the choice.
 const P: f64 = 0.625;
@@ -264,10 +267,8 @@ impl Winograd {
         jobs.into_par_iter().for_each(|(panel, out)| {
             for c in 0..cin {
                 for v in 0..panel.vecs {
-                    let u = transform_filters(weights, (panel.block + v) * LANES, c);
-                    for (f, u) in u.iter().enumerate() {
-                        out[(f * cin + c) * panel.vecs + v] = Pixel(u.map(|x| x as f32));
-                    }
+                    let mut out = out[c * panel.vecs + v..].iter_mut().step_by(cin * panel.vecs);
+                    transform_filters(&filters_of(weights, (panel.block + v) * LANES, c), &mut out);
                 }
             }
         });
@@ -288,33 +289,28 @@ fn transformed_runs(channels: usize) -> Vec<Run> {
         .collect()
 }
 
-/// `G g Gᵀ` of 16 output channels from `o` on, input channel `c`, as `[36][16]`.
-fn transform_filters(weights: &Weights<'_>, o: usize, c: usize) -> [[f64; LANES]; FREQUENCIES] {
+/// The filters of 16 output channels from `o` on, input channel `c`, as `[9][16]`.
+fn filters_of(weights: &Weights<'_>, o: usize, c: usize) -> [[f64; LANES]; 9] {
     let mut g = [[0.0; LANES]; 9];
     for k in 0..LANES.min(weights.outputs - o) {
         for (tap, g) in g.iter_mut().enumerate() {
             g[k] = f64::from(weights.at(o + k, c, tap));
         }
     }
-    let mut t = [[[0.0; LANES]; 3]; SIDE];
-    let mut u = [[0.0; LANES]; FREQUENCIES];
-    for i in 0..SIDE {
-        for x in 0..3 {
-            for y in 0..3 {
-                for k in 0..LANES {
-                    t[i][x][k] += G[i][y] * g[y * 3 + x][k];
-                }
-            }
-        }
-        for j in 0..SIDE {
-            for x in 0..3 {
-                for k in 0..LANES {
-                    u[i * SIDE + j][k] += G[j][x] * t[i][x][k];
-                }
-            }
+    g
+}
+
+/// `G g Gᵀ`, frequency after frequency to `out`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn transform_filters(g: &[[f64; LANES]; 9], out: &mut StepBy<IterMut<'_, Pixel>>) {
+    for by_row in &G {
+        let t: [[f64; LANES]; 3] = std::array::from_fn(|x| {
+            std::array::from_fn(|k| (0..3).fold(0.0, |sum, y| sum + by_row[y] * g[y * 3 + x][k]))
+        });
+        for (by_column, out) in G.iter().zip(&mut *out) {
+            out.0 = std::array::from_fn(|k| (0..3).fold(0.0, |sum, x| sum + by_column[x] * t[x][k]) as f32);
         }
     }
-    u
 }
 
 entry!(pub(super) fn forward = forward_strip(
@@ -467,8 +463,7 @@ impl GradPlan {
             grad[o * cin * 9..(o + count) * cin * 9].par_chunks_mut(LANES * cin * 9).enumerate().for_each(
                 |(v, grad)| {
                     for c in 0..cin {
-                        let u = |f: usize| &sums[(f * cin + c) * panel.vecs + v].0;
-                        let g = transform_back(u);
+                        let g = transform_back(&sums[c * panel.vecs + v..], cin * panel.vecs);
                         for (k, filter) in grad.chunks_exact_mut(cin * 9).enumerate() {
                             for (tap, g) in g.iter().enumerate() {
                                 filter[c * 9 + tap] = g[k] as f32;
@@ -481,13 +476,14 @@ impl GradPlan {
     }
 }
 
-/// `Gᵀ u G` of 16 output channels, as `[9][16]`.
-fn transform_back<'a>(u: impl Fn(usize) -> &'a [f32; LANES]) -> [[f64; LANES]; 9] {
+/// `Gᵀ u G` of 16 output channels, as `[9][16]`, of frequencies that are `step` apart.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn transform_back(u: &[Pixel], step: usize) -> [[f64; LANES]; 9] {
     let mut g = [[0.0; LANES]; 9];
     for (i, row) in G.iter().enumerate() {
         let mut t = [[0.0; LANES]; 3];
         for (j, column) in G.iter().enumerate() {
-            let u = u(i * SIDE + j);
+            let u = &u[(i * SIDE + j) * step].0;
             for x in 0..3 {
                 for k in 0..LANES {
                     t[x][k] += column[x] * f64::from(u[k]);
