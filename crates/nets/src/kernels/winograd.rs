@@ -13,6 +13,7 @@ use super::{GradStrip, Panel, Strip, Weights};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::iter::StepBy;
+use std::mem::MaybeUninit;
 use std::slice::IterMut;
 
 /// Interpolation points; see the module header for the choice.
@@ -96,12 +97,20 @@ unsafe fn spread_1d<S: Simd>(y: [S; TILE]) -> [S; SIDE] {
     }
 }
 
+/// A row all of which has been written. Rows begin uninitialised: zeroing what AVX2 cannot hold in its registers is a call of `memset`
+/// for every tile, half as long as the transform.
+#[inline(always)]
+unsafe fn written<S: Simd, const N: usize>(row: &[MaybeUninit<S>; N]) -> [S; N] {
+    // SAFETY: the caller has written every entry.
+    unsafe { row.as_ptr().cast::<[S; N]>().read() }
+}
+
 /// `Bᵀ d B` of the 6×6 pixels at `src`, frequency `f` to `dst + f·step`.
 #[inline(always)]
 unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: usize) {
     // SAFETY: the caller gives the memory of both.
     unsafe {
-        let mut t = [[S::splat(0.0); SIDE]; SIDE];
+        let mut t = [[MaybeUninit::<S>::uninit(); SIDE]; SIDE];
         let mut x = 0;
         while x < SIDE {
             let mut d = [S::splat(0.0); SIDE];
@@ -113,14 +122,14 @@ unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: 
             let d = input_1d(d);
             let mut y = 0;
             while y < SIDE {
-                t[y][x] = d[y];
+                t[y][x].write(d[y]);
                 y += 1;
             }
             x += 1;
         }
         let mut y = 0;
         while y < SIDE {
-            let v = input_1d(t[y]);
+            let v = input_1d(written(&t[y]));
             let mut x = 0;
             while x < SIDE {
                 v[x].store(dst.add((y * SIDE + x) * step));
@@ -136,7 +145,7 @@ unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: 
 unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, bias: S, floor: S, dst: *mut f32, row: usize) {
     // SAFETY: the caller gives the memory of both.
     unsafe {
-        let mut t = [[S::splat(0.0); SIDE]; TILE];
+        let mut t = [[MaybeUninit::<S>::uninit(); SIDE]; TILE];
         let mut x = 0;
         while x < SIDE {
             let mut d = [S::splat(0.0); SIDE];
@@ -148,14 +157,14 @@ unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, bias: S, floor: S, ds
             let d = output_1d(d);
             let mut y = 0;
             while y < TILE {
-                t[y][x] = d[y];
+                t[y][x].write(d[y]);
                 y += 1;
             }
             x += 1;
         }
         let mut y = 0;
         while y < TILE {
-            let v = output_1d(t[y]);
+            let v = output_1d(written(&t[y]));
             let mut x = 0;
             while x < TILE {
                 v[x].add(bias).at_least(floor).store(dst.add(y * row + x * LANES));
@@ -171,7 +180,7 @@ unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, bias: S, floor: S, ds
 unsafe fn spread_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: usize) {
     // SAFETY: the caller gives the memory of both.
     unsafe {
-        let mut t = [[S::splat(0.0); TILE]; SIDE];
+        let mut t = [[MaybeUninit::<S>::uninit(); TILE]; SIDE];
         let mut x = 0;
         while x < TILE {
             let mut d = [S::splat(0.0); TILE];
@@ -183,14 +192,14 @@ unsafe fn spread_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step:
             let d = spread_1d(d);
             let mut y = 0;
             while y < SIDE {
-                t[y][x] = d[y];
+                t[y][x].write(d[y]);
                 y += 1;
             }
             x += 1;
         }
         let mut y = 0;
         while y < SIDE {
-            let v = spread_1d(t[y]);
+            let v = spread_1d(written(&t[y]));
             let mut x = 0;
             while x < SIDE {
                 v[x].store(dst.add((y * SIDE + x) * step));

@@ -238,6 +238,9 @@ pub struct SnapshotsConfig {
     /// Share of the clips whose masks are told with errors of up to 0.3 pixels, 3 % of gain and a pedestal of 1 %. Default 0.
     #[serde(default)]
     pub mask_errors: f64,
+    /// Iterations of TV that a solve starts from, 0 to 1000; 0 is y / Σ C. A solve with the network has to start alike. Default 0.
+    #[serde(default)]
+    pub start_iterations: usize,
 }
 
 /// How masks look.
@@ -425,7 +428,7 @@ impl TrainConfig {
 
     fn validate_snapshots(&self, snapshots: &SnapshotsConfig) -> Result<()> {
         let SnapshotsConfig { frames: [few, many], density: [thin, dense], .. } = snapshots;
-        let SnapshotsConfig { masks, noise, holes, saturated, mask_errors, .. } = snapshots;
+        let SnapshotsConfig { masks, noise, holes, saturated, mask_errors, start_iterations, .. } = snapshots;
         check(self.data.frames == 1, "data.frames", self.data.frames, "left out: snapshots.frames says how many")?;
         check(self.data.patch.is_multiple_of(8), "data.patch", self.data.patch, "a multiple of 8")?;
         let frames = (1..=64).contains(few) && (*few..=64).contains(many);
@@ -442,7 +445,8 @@ impl TrainConfig {
         check(level(*noise), "snapshots.noise", noise, LEVELS)?;
         check((0.0..=0.5).contains(holes), "snapshots.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(saturated), "snapshots.saturated", saturated, "0 to 1")?;
-        check((0.0..=1.0).contains(mask_errors), "snapshots.mask_errors", mask_errors, "0 to 1")
+        check((0.0..=1.0).contains(mask_errors), "snapshots.mask_errors", mask_errors, "0 to 1")?;
+        check(*start_iterations <= 1000, "snapshots.start_iterations", start_iterations, "0 to 1000")
     }
 
     /// Whether a layer, or a variable of one, begins anew.

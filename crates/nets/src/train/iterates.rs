@@ -17,6 +17,12 @@ use std::sync::Arc;
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
 const START_WEIGHT: f32 = 0.1;
 
+/// The prior of the start, for each sub-lattice of a color sensor.
+pub(super) fn start_prior(measurement: &Measurement) -> Box<dyn Prior> {
+    let tv = Tv::new(START_WEIGHT);
+    if measurement.cfa().is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) }
+}
+
 /// A call of the denoiser in a solve.
 pub(super) struct RecordedCall {
     /// What it is given, `[T, C, H, W]`, the right way round.
@@ -122,8 +128,7 @@ impl Simulated {
     ) -> Result<Array4<f32>> {
         let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: Some(s / 255.0), iterations: 1 }).collect();
         let cfa = self.measurement.cfa();
-        let tv = Tv::new(START_WEIGHT);
-        let mut warm_up: Box<dyn Prior> = if cfa.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) };
+        let mut warm_up = start_prior(&self.measurement);
         let start = match start_iterations {
             0 => Start::Mean,
             iterations => Start::Warm { prior: &mut *warm_up, stage: Stage { sigma: None, iterations } },
@@ -158,7 +163,7 @@ fn random_masks(shape: VideoShape, settings: &IteratesConfig, rng: &mut impl Rng
     masks.map_err(unusable)
 }
 
-fn unusable(error: impl Display) -> Error {
+pub(super) fn unusable(error: impl Display) -> Error {
     Error::Data(error.to_string())
 }
 
@@ -193,7 +198,7 @@ impl Denoiser for Recorder<'_> {
 }
 
 /// The error of this crate that made a solver fail.
-fn typed(error: SolveError) -> Error {
+pub(super) fn typed(error: SolveError) -> Error {
     let text = error.to_string();
     let source: Option<BoxError> = match error {
         SolveError::Prior { source, .. } => Some(source),

@@ -2,15 +2,18 @@
 //! its own, so that no single camera is learned by heart.
 
 use super::config::{Loss, MaskKind, SnapshotsConfig};
+use super::iterates::{start_prior, typed, unusable};
 use super::step::Gradients;
 use crate::unfolding::{Snapshot, UnfoldingNet, phases};
 use crate::{Error, Result};
+use admm::{Call, Estimate, Gap, Plan, Prior, PriorError, Stage, Start, run};
 use candle_core::{Tensor, Var};
-use ndarray::{Array2, Array3, Array4, ArrayView4, Axis, Zip, s};
+use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, Axis, Zip, s};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
-use sci_forward::CfaPattern;
 use sci_forward::bayer::mosaic_into;
+use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement};
+use std::sync::Arc;
 
 /// Largest errors of masks that are told wrongly: pixels, share of the gain of a frame, share of the full transmittance that leaks.
 const MASK_SHIFT: f32 = 0.3;
@@ -49,16 +52,23 @@ impl Exercise {
         for mut mask in told.outer_iter_mut() {
             Zip::from(&mut mask).and(&closed).for_each(|c, &closed| *c = if closed { 0.0 } else { *c });
         }
-        Ok(Self { snapshot: Snapshot::new(told.view(), y.view())?, clean })
+        let cfa = (clip.len_of(Axis(1)) == 3).then_some(CfaPattern::Rggb);
+        Ok(Self { snapshot: snapshot(told, y, cfa, settings.start_iterations)?, clean })
     }
 
     /// A clip through binary masks of density ½, with white noise on the measurement: what networks are compared by.
-    pub(super) fn plain(clip: ArrayView4<'_, f32>, sigma: f32, rng: &mut impl Rng) -> Result<Self> {
+    pub(super) fn plain(
+        clip: ArrayView4<'_, f32>,
+        sigma: f32,
+        start_iterations: usize,
+        rng: &mut impl Rng,
+    ) -> Result<Self> {
         let seen = seen(clip);
         let masks = random(seen.dim(), 0.5, rng);
         let mut y = (&masks * &seen).sum_axis(Axis(0));
         y.mapv_inplace(|y| y + sigma * normal(rng));
-        Ok(Self { snapshot: Snapshot::new(masks.view(), y.view())?, clean: clean_phases(clip)? })
+        let cfa = (clip.len_of(Axis(1)) == 3).then_some(CfaPattern::Rggb);
+        Ok(Self { snapshot: snapshot(masks, y, cfa, start_iterations)?, clean: clean_phases(clip)? })
     }
 
     pub(super) fn snapshot(&self) -> &Snapshot {
@@ -85,7 +95,38 @@ impl Exercise {
     }
 }
 
-/// What the sensor sees of a clip: itself, or its RGGB mosaic.
+/// A measurement with its x₀: what plain GAP gives a prior first.
+fn snapshot(masks: Array3<f32>, y: Array2<f32>, cfa: Option<CfaPattern>, start_iterations: usize) -> Result<Snapshot> {
+    let operator = MaskOperator::new(MaskStack::new(masks).map_err(unusable)?);
+    let masks = operator.source().view().to_owned();
+    let measurement = Measurement::new(Arc::new(operator), y).map_err(unusable)?.with_cfa(cfa);
+    let stage = |iterations| Stage { sigma: None, iterations };
+    let mut prior = start_prior(&measurement);
+    let start = match start_iterations {
+        0 => Start::Mean,
+        iterations => Start::Warm { prior: &mut *prior, stage: stage(iterations) },
+    };
+    let begun = run(&mut Gap::plain(Nothing), &measurement, start, &Plan::new([stage(1)]), &mut ()).map_err(typed)?;
+    Snapshot::new(masks.view(), measurement.y(), begun.estimate.sensor.view())
+}
+
+/// A prior that changes nothing.
+struct Nothing;
+
+impl Prior for Nothing {
+    fn apply(
+        &mut self,
+        _: &Call<'_>,
+        noisy: ArrayView3<'_, f32>,
+        out: &mut Estimate,
+    ) -> std::result::Result<(), PriorError> {
+        out.rgb = None;
+        out.sensor.assign(&noisy);
+        Ok(())
+    }
+}
+
+/// What a sensor sees of a clip: itself, or its RGGB mosaic.
 fn seen(clip: ArrayView4<'_, f32>) -> Array3<f32> {
     let (t, c, h, w) = clip.dim();
     if c == 1 {
@@ -231,7 +272,6 @@ pub(super) fn cut(video: &Array4<f32>, multiple: usize) -> Array4<f32> {
 mod tests {
     use super::*;
     use crate::UnfoldingSpec;
-    use ndarray::ArrayView3;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -246,6 +286,7 @@ mod tests {
             holes: 0.05,
             saturated: 0.5,
             mask_errors: 0.5,
+            start_iterations: 2,
         }
     }
 

@@ -612,10 +612,11 @@ impl Trainer {
     /// PSNR of the solves of the middle of each held-out clip, without noise on the measurement or with that of a level in 0..255 units.
     fn score_solves(&self, net: &UnfoldingNet, sigma: Option<f32>) -> Result<Score> {
         let mut psnrs = Vec::new();
+        let start_iterations = self.config.snapshots.as_ref().map_or(0, |snapshots| snapshots.start_iterations);
         for (i, clip) in self.data.validation.iter().enumerate() {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = cut(&centre(&to_video(clip, VALIDATION_FRAMES)), MULTIPLE);
-            let exercise = Exercise::plain(clean.view(), sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
+            let exercise = Exercise::plain(clean.view(), sigma.unwrap_or(0.0) / 255.0, start_iterations, &mut rng)?;
             let results = net.unfold(exercise.snapshot())?;
             let errors = results.last().map(|last| exercise.errors(last)).transpose()?.unwrap_or_default();
             psnrs.extend(errors.into_iter().map(|error| -10.0 * f64::from(error).log10()));

@@ -2,7 +2,7 @@
 //! small U-shaped network in turn, trained as one.
 //!
 //! ```text
-//! x₀ = y / Σ_t C_t in every frame
+//! v₋₁ = y / Σ_t C_t in every frame,  x₀ = a few iterations of TV, which cost next to nothing
 //! v_k, h_k = network_k(x_k, x_k − v_{k−1}, h_{k−1};  y / Σ C, C_t, Σ C),      x_{k+1} = v_k + Hᵀ (y − H v_k) / Σ_t C_t²
 //! ```
 //!
@@ -270,7 +270,7 @@ impl UnfoldingNet {
     /// The solve as a differentiable function of the weights: the result of each iteration, all as phases `[T, 4 C, H/2, W/2]`.
     pub(crate) fn unfold(&self, snapshot: &Snapshot) -> Result<Vec<Tensor>> {
         let mut results: Vec<Tensor> = Vec::new();
-        let (mut x, mut sensor, mut features) = (snapshot.start.clone(), snapshot.start.clone(), None);
+        let (mut x, mut sensor, mut features) = (snapshot.start.clone(), snapshot.mean.clone(), None);
         for k in 0..self.spec.iterations {
             let base = self.base(&x, results.last())?;
             let changed = (&x - &sensor)?;
@@ -541,7 +541,8 @@ impl UnfoldingNet {
     }
 }
 
-/// The network as the prior of plain GAP, from `Start::Mean`: one iteration of the network in each of the solver's. A solve that begins anew (iteration
+/// The network as the prior of plain GAP, from the start that it was trained from (the shipped ones: `Start::Warm` with 20 iterations of
+/// TV): one iteration of the network in each of the solver's. A solve that begins anew (iteration
 /// 0) begins with its own measurement.
 #[derive(Debug)]
 pub struct UnfoldingPrior {
@@ -730,15 +731,17 @@ pub(crate) struct Snapshot {
     /// 1 / Σ C²; 0 where no mask is open.
     inverse: Tensor,
     /// y / Σ C in each frame.
+    mean: Tensor,
+    /// x₀.
     start: Tensor,
     /// What the network is shown beside the iterates.
     beside: Tensor,
 }
 
 impl Snapshot {
-    /// Of masks `[T, H, W]` and a measurement `[H, W]` whose sides are multiples of [`MULTIPLE`], of an RGGB sensor if the network is for
-    /// color.
-    pub(crate) fn new(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<Self> {
+    /// Of masks `[T, H, W]`, a measurement `[H, W]` whose sides are multiples of [`MULTIPLE`], of an RGGB sensor if the network is for
+    /// color, and x₀ `[T, H, W]`.
+    pub(crate) fn new(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>, start: ArrayView3<'_, f32>) -> Result<Self> {
         let shown = Shown::new(masks, y);
         let frames = masks.len_of(Axis(0));
         let gram = masks.mapv(|c| c * c).sum_axis(Axis(0));
@@ -748,13 +751,14 @@ impl Snapshot {
             let (_, c, h, w) = image.dims4()?;
             image.broadcast_as((frames, c, h, w))?.contiguous()
         };
-        let start = each(&image(shown.mean.view())?)?;
+        let mean = each(&image(shown.mean.view())?)?;
         let open = each(&image(shown.open.view())?)?;
         let masks_shown = phases(shown.masks.view())?;
-        let behind = ((&start - f64::from(GRAY))? * &masks_shown)?;
-        let beside = (Tensor::cat(&[&start, &masks_shown, &open], 1)? - f64::from(GRAY))?;
+        let behind = ((&mean - f64::from(GRAY))? * &masks_shown)?;
+        let beside = (Tensor::cat(&[&mean, &masks_shown, &open], 1)? - f64::from(GRAY))?;
         let beside = Tensor::cat(&[&beside, &behind], 1)?;
-        Ok(Self { masks: phases(masks)?, y: image(y)?, inverse: image(inverse.view())?, start, beside })
+        let (masks, inverse) = (phases(masks)?, image(inverse.view())?);
+        Ok(Self { masks, y: image(y)?, inverse, mean, start: phases(start)?, beside })
     }
 
     /// `v + Hᵀ (y − H v) / Σ C²`.
@@ -766,9 +770,10 @@ impl Snapshot {
     /// In another number type, for tests.
     #[cfg(test)]
     fn to_dtype(&self, dtype: candle_core::DType) -> Self {
-        let [masks, y, inverse, start, beside] =
-            [&self.masks, &self.y, &self.inverse, &self.start, &self.beside].map(|t| t.to_dtype(dtype).unwrap());
-        Self { masks, y, inverse, start, beside }
+        let [masks, y, inverse, mean, start, beside] =
+            [&self.masks, &self.y, &self.inverse, &self.mean, &self.start, &self.beside]
+                .map(|t| t.to_dtype(dtype).unwrap());
+        Self { masks, y, inverse, mean, start, beside }
     }
 }
 

@@ -31,17 +31,35 @@ fn measured(dim: (usize, usize, usize)) -> (Array3<f32>, Array2<f32>) {
     (masks, y)
 }
 
+/// A measurement for the differentiable solve, from a start that is none of its own.
+fn snapshot(masks: &Array3<f32>, y: &Array2<f32>) -> Snapshot {
+    Snapshot::new(masks.view(), y.view(), start(masks, y).view()).unwrap()
+}
+
+/// A video that explains the measurement.
+fn start(masks: &Array3<f32>, y: &Array2<f32>) -> Array3<f32> {
+    let (_, height, width) = masks.dim();
+    let frame = Array2::from_shape_fn((height, width), |(i, j)| ((3 * i + 5 * j) % 7) as f32 / 7.0);
+    project(masks, y, &(Array3::zeros(masks.dim()) + &frame))
+}
+
+fn project(masks: &Array3<f32>, y: &Array2<f32>, v: &Array3<f32>) -> Array3<f32> {
+    let gram = masks.mapv(|c| c * c).sum_axis(Axis(0));
+    let lacks = Zip::from(y)
+        .and(&(masks * v).sum_axis(Axis(0)))
+        .and(&gram)
+        .map_collect(|y, hv, &gram| if gram > 0.0 { (y - hv) / gram } else { 0.0 });
+    v + masks * &lacks
+}
+
 /// All iterations without gradients; the data step is the solver's.
 fn solved(net: &mut UnfoldingNet, masks: &Array3<f32>, y: &Array2<f32>, cfa: Option<CfaPattern>) -> Array4<f32> {
     let mut solve = net.begin(masks.view(), y.view(), cfa).unwrap();
-    let gram = masks.mapv(|c| c * c).sum_axis(Axis(0));
+    let mut x = start(masks, y);
     for _ in 0..net.spec().iterations {
+        net.advance(&mut solve, x.view()).unwrap();
         let v = Array3::from_shape_fn(masks.dim(), |(t, i, j)| solve.sensor(t, i, j));
-        let lacks = Zip::from(y)
-            .and(&(masks * &v).sum_axis(Axis(0)))
-            .and(&gram)
-            .map_collect(|y, hv, &gram| if gram > 0.0 { (y - hv) / gram } else { 0.0 });
-        net.advance(&mut solve, (v + masks * &lacks).view()).unwrap();
+        x = project(masks, y, &v);
     }
     solve.last
 }
@@ -51,7 +69,7 @@ fn inference_is_the_differentiable_solve() {
     for (channels, frames) in [(1, 5), (3, 3), (1, 1)] {
         let mut net = loud(UnfoldingSpec { channels, ..SPEC });
         let (masks, y) = measured((frames, 16, 24));
-        let results = net.unfold(&Snapshot::new(masks.view(), y.view()).unwrap()).unwrap();
+        let results = net.unfold(&snapshot(&masks, &y)).unwrap();
         let found = solved(&mut net, &masks, &y, (channels == 3).then_some(CfaPattern::Rggb));
         let found = Tensor::from_iter(found.iter().copied(), &Device::Cpu).unwrap().reshape(found.dim()).unwrap();
         let expected = pixel_shuffle(results.last().unwrap(), 2).unwrap();
@@ -89,7 +107,7 @@ fn a_sensor_that_begins_elsewhere_sees_the_same_colors() {
 fn an_untrained_network_projects() {
     let net = UnfoldingNet::random(SPEC, 1).unwrap();
     let (masks, y) = measured((4, 8, 8));
-    let snapshot = Snapshot::new(masks.view(), y.view()).unwrap();
+    let snapshot = snapshot(&masks, &y);
     let results = net.unfold(&snapshot).unwrap();
     let change = (results.last().unwrap() - &snapshot.start).unwrap().abs().unwrap().max_all().unwrap();
     assert!(change.to_scalar::<f32>().unwrap() < 1e-5);
@@ -100,7 +118,7 @@ fn the_scale_of_masks_and_measurement_does_not_matter() {
     let net = loud(SPEC);
     let (masks, y) = measured((3, 8, 8));
     let last = |scale: f32| {
-        let snapshot = Snapshot::new((&masks * scale).view(), (&y * scale).view()).unwrap();
+        let snapshot = snapshot(&(&masks * scale), &(&y * scale));
         net.unfold(&snapshot).unwrap().pop().unwrap()
     };
     let change = (last(1.0) - last(100.0)).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -113,7 +131,7 @@ fn gradients_are_slopes() {
     for channels in [1, 3] {
         let mut net = loud(UnfoldingSpec { channels, ..SPEC });
         let (masks, y) = measured((3, 8, 16));
-        let snapshot = Snapshot::new(masks.view(), y.view()).unwrap();
+        let snapshot = snapshot(&masks, &y);
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let g: Vec<Tensor> = (0..2).map(|_| random(&[3, 4 * channels, 4, 8], &mut rng)).collect();
         let vars = net.make_trainable().unwrap();
