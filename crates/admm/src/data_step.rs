@@ -9,6 +9,7 @@ use ndarray::parallel::prelude::*;
 use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis, Zip};
 use sci_forward::{MaskSource, Measurement};
 use std::borrow::Cow;
+use std::ops::Range;
 
 /// Rows of one parallel task.
 const BAND: usize = 16;
@@ -37,12 +38,14 @@ impl Progress {
 /// A closed-form data step, the heart of GAP and ADMM:
 ///
 /// ```text
-/// to = from + Hᵀ (t − H p) / (diag(H Hᵀ) + damping)
+/// to = from + Hᵀ (t − H p) / (diag(H Hᵀ) + damping + precision · variance)
 /// ```
 ///
 /// with the target `t = y`, or with momentum (accelerated GAP) `y1 ← y1 + (y − H from)`, `t = y1`, at the point `p = from`, or
 /// with a mirror z (ADMM) `p = 2 from − z`. `damping = 0` with `p = from` projects onto `{x : H x = t}`; `damping = γ > 0` solves
-/// `argmin_x ‖y − H x‖² + γ‖x − from‖²` (paper, Eq. `qv_k+1`). Pixels with `diag(H Hᵀ) = 0` stay as they are.
+/// `argmin_x ‖y − H x‖² + γ‖x − from‖²` (paper, Eq. `qv_k+1`). With the variance n of the measurement's noise
+/// ([`Measurement::variance`]) and `from` known to a variance of s², `precision = 1/s²` gives the likeliest x,
+/// `argmin_x Σ (y − H x)²/n + ‖x − from‖²/s²`. Pixels with `diag(H Hᵀ) = 0` stay as they are.
 ///
 /// ```
 /// use std::sync::Arc;
@@ -64,8 +67,12 @@ impl Progress {
 pub struct DataStep<'a> {
     /// γ ≥ 0, in the unit of `diag(H Hᵀ)`.
     pub damping: f32,
+    /// How well `from` is known, 1/s² ≥ 0; of no account where no noise is known of.
+    pub precision: f32,
     /// The accumulated measurement `y1` `[H, W]` of accelerated GAP, in row-major order, updated in place.
     pub momentum: Option<&'a mut Array2<f32>>,
+    /// Leaves `y1` as it is: what is left of the residual is noise, not to be added up.
+    pub hold_momentum: bool,
     /// z `[T, H, W]`, if the step is taken at `2 from − z`.
     pub mirror: Option<ArrayView3<'a, f32>>,
     /// The iterate before `from`, `[T, H, W]`, if its change is wanted.
@@ -97,7 +104,8 @@ impl DataStep<'_> {
         from: ArrayView3<'_, f32>,
         mut to: ArrayViewMut3<'_, f32>,
     ) -> Progress {
-        let Self { damping, momentum, mirror, previous } = self;
+        let Self { damping, precision, momentum, hold_momentum, mirror, previous } = self;
+        let variance = measurement.variance().filter(|_| precision > 0.0);
         let previous = previous.unwrap_or(from);
         let (y, gram, width) = (measurement.y(), measurement.operator().gram(), measurement.shape().width);
         let frames = from.dim().0;
@@ -118,7 +126,14 @@ impl DataStep<'_> {
                         from: rows_at(from, row),
                         previous: rows_at(previous, row),
                         mirror: mirror.map(|z| rows_at(z, row)),
-                        target: Target { gram: packed(gram.row(row)), y: packed(y.row(row)), damping },
+                        target: Target {
+                            gram: packed(gram.row(row)),
+                            y: packed(y.row(row)),
+                            variance: variance.map(|variance| packed(variance.index_axis_move(Axis(0), row))),
+                            damping,
+                            precision,
+                            hold_momentum,
+                        },
                     };
                     let y1 = y1.as_mut().map(|y1| &mut y1[i * width..][..width]);
                     sum = sum.plus(row.step(to, y1, &mut chunk));
@@ -136,20 +151,24 @@ impl DataStep<'_> {
         from: ArrayView3<'_, f32>,
         mut to: ArrayViewMut3<'_, f32>,
     ) -> Progress {
-        let Self { damping, momentum, mirror, previous } = self;
+        let Self { damping, precision, momentum, hold_momentum, mirror, previous } = self;
         let (operator, y) = (measurement.operator(), measurement.y());
         let progress = progress(measurement, from, previous.unwrap_or(from));
         let mut h = operator.forward(from);
         let point = mirror.map(|z| &h * 2.0 - operator.forward(z));
         match (momentum, point) {
             (Some(y1), _) => Zip::from(&mut h).and(y).and(y1).for_each(|h, &y, y1| {
-                *y1 += y - *h;
+                *y1 += if hold_momentum { 0.0 } else { y - *h };
                 *h = *y1 - *h;
             }),
             (None, Some(point)) => Zip::from(&mut h).and(y).and(&point).for_each(|h, &y, &point| *h = y - point),
             (None, None) => h.zip_mut_with(&y, |h, &y| *h = y - *h),
         }
-        h.zip_mut_with(&operator.gram(), |c, &gram| *c = if gram > 0.0 { *c / (gram + damping) } else { 0.0 });
+        let mut divisor = operator.gram().mapv(|gram| if gram > 0.0 { gram + damping } else { f32::INFINITY });
+        if let Some(variance) = measurement.variance() {
+            divisor.zip_mut_with(&variance, |divisor, &variance| *divisor += precision * variance);
+        }
+        h /= &divisor;
         operator.adjoint_into(h.view(), to.view_mut());
         Zip::from(&mut to).and(from).par_for_each(|to, &from| *to += from);
         progress
@@ -215,7 +234,10 @@ fn rows_at(video: ArrayView3<'_, f32>, row: usize) -> ArrayView2<'_, f32> {
 struct Target<'a> {
     gram: Cow<'a, [f32]>,
     y: Cow<'a, [f32]>,
+    variance: Option<Cow<'a, [f32]>>,
     damping: f32,
+    precision: f32,
+    hold_momentum: bool,
 }
 
 /// What the step of one row reads; the videos' rows are `[T, W]`.
@@ -239,12 +261,15 @@ struct Chunk {
     hx: Vec<f32>,
     /// `H z`.
     hz: Option<Vec<f32>>,
+    /// What the difference to the target is divided by.
+    divisor: Vec<f32>,
 }
 
 impl Chunk {
     fn new(frames: usize, mirrored: bool) -> Self {
         let (video, masks) = (vec![0.0; frames * CHUNK], vec![0.0; frames * CHUNK]);
-        Self { video, masks, hx: vec![0.0; CHUNK], hz: mirrored.then(|| vec![0.0; CHUNK]) }
+        let row = || vec![0.0; CHUNK];
+        Self { video, masks, hx: row(), hz: mirrored.then(row), divisor: row() }
     }
 }
 
@@ -258,14 +283,16 @@ impl Row<'_> {
             let columns = start..(start + CHUNK).min(width);
             let count = columns.len();
             self.read(start, count, chunk, &mut norms);
-            let Target { gram, y, damping } = &self.target;
+            let Target { gram, y, hold_momentum, .. } = &self.target;
             let (gram, y) = (&gram[columns.clone()], &y[columns.clone()]);
-            let hx = &mut chunk.hx[..count];
+            let (hx, divisor) = (&mut chunk.hx[..count], &mut chunk.divisor[..count]);
             residual += squared_residual(hx, y, gram);
+            self.target.divisor(columns.clone(), divisor);
             match (&mut y1, &chunk.hz) {
-                (Some(y1), _) => accelerated_coefficients(hx, y, gram, *damping, &mut y1[columns.clone()]),
-                (None, Some(hz)) => mirrored_coefficients(hx, &hz[..count], y, gram, *damping),
-                (None, None) => coefficients(hx, y, gram, *damping),
+                (Some(y1), _) if *hold_momentum => coefficients(hx, &y1[columns.clone()], divisor),
+                (Some(y1), _) => accelerated_coefficients(hx, y, divisor, &mut y1[columns.clone()]),
+                (None, Some(hz)) => mirrored_coefficients(hx, &hz[..count], y, divisor),
+                (None, None) => coefficients(hx, y, divisor),
             }
             for (t, mut to) in to.outer_iter_mut().enumerate() {
                 let (video, masks) = (&chunk.video[t * count..][..count], &chunk.masks[t * count..][..count]);
@@ -283,7 +310,7 @@ impl Row<'_> {
 
     /// Copies `count` columns of all frames and masks, and sums them up.
     fn read(&self, start: usize, count: usize, chunk: &mut Chunk, norms: &mut Norms) {
-        let Chunk { video, masks, hx, hz } = chunk;
+        let Chunk { video, masks, hx, hz, .. } = chunk;
         hx.fill(0.0);
         for (t, (x, previous)) in self.from.outer_iter().zip(self.previous.outer_iter()).enumerate() {
             let (x, previous) = (packed(x), packed(previous));
@@ -317,28 +344,53 @@ fn write_sum(to: &mut [f32], x: &[f32], c: &[f32], v: &[f32]) {
     }
 }
 
-/// Turns `H x` of a chunk into `(y − H x) / (gram + damping)`.
+impl Target<'_> {
+    /// `gram + damping + precision · variance` of some columns; infinite where no mask is open, so that nothing is added.
+    fn divisor(&self, columns: Range<usize>, to: &mut [f32]) {
+        let gram = &self.gram[columns.clone()];
+        match &self.variance {
+            Some(variance) => noisy_divisor(gram, self.damping, &variance[columns], self.precision, to),
+            None => divisor(gram, self.damping, to),
+        }
+    }
+}
+
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn coefficients(hx: &mut [f32], y: &[f32], gram: &[f32], damping: f32) {
-    for ((hx, y), gram) in hx.iter_mut().zip(y).zip(gram) {
-        *hx = if *gram > 0.0 { (y - *hx) / (gram + damping) } else { 0.0 };
+fn divisor(gram: &[f32], damping: f32, to: &mut [f32]) {
+    for (to, gram) in to.iter_mut().zip(gram) {
+        *to = if *gram > 0.0 { gram + damping } else { f32::INFINITY };
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn noisy_divisor(gram: &[f32], damping: f32, variance: &[f32], precision: f32, to: &mut [f32]) {
+    for ((to, gram), variance) in to.iter_mut().zip(gram).zip(variance) {
+        *to = if *gram > 0.0 { gram + damping + precision * variance } else { f32::INFINITY };
+    }
+}
+
+/// Turns `H x` of a chunk into `(y − H x) / divisor`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn coefficients(hx: &mut [f32], y: &[f32], divisor: &[f32]) {
+    for ((hx, y), divisor) in hx.iter_mut().zip(y).zip(divisor) {
+        *hx = (y - *hx) / divisor;
     }
 }
 
 /// As [`coefficients`], at `2 x − z`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn mirrored_coefficients(hx: &mut [f32], hz: &[f32], y: &[f32], gram: &[f32], damping: f32) {
-    for (((hx, hz), y), gram) in hx.iter_mut().zip(hz).zip(y).zip(gram) {
-        *hx = if *gram > 0.0 { (y - (2.0 * *hx - hz)) / (gram + damping) } else { 0.0 };
+fn mirrored_coefficients(hx: &mut [f32], hz: &[f32], y: &[f32], divisor: &[f32]) {
+    for (((hx, hz), y), divisor) in hx.iter_mut().zip(hz).zip(y).zip(divisor) {
+        *hx = (y - (2.0 * *hx - hz)) / divisor;
     }
 }
 
 /// As [`coefficients`], but adds `y − H x` to `y1` and aims at that.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn accelerated_coefficients(hx: &mut [f32], y: &[f32], gram: &[f32], damping: f32, y1: &mut [f32]) {
-    for (((hx, y), gram), y1) in hx.iter_mut().zip(y).zip(gram).zip(y1) {
+fn accelerated_coefficients(hx: &mut [f32], y: &[f32], divisor: &[f32], y1: &mut [f32]) {
+    for (((hx, y), divisor), y1) in hx.iter_mut().zip(y).zip(divisor).zip(y1) {
         *y1 += y - *hx;
-        *hx = if *gram > 0.0 { (*y1 - *hx) / (gram + damping) } else { 0.0 };
+        *hx = (*y1 - *hx) / divisor;
     }
 }
 

@@ -27,6 +27,7 @@
 //! ```
 
 mod adapters;
+mod calibrate;
 mod data_step;
 mod priors;
 #[cfg(test)]
@@ -38,6 +39,8 @@ mod start;
 pub use adapters::{
     Clipped, Demosaicked, Flips, PerLattice, PerStage, TileCounter, TileCounts, Tiles, flipped_axes, still,
 };
+pub use calibrate::{CalibrateError, Calibrated, Calibration, Parameter};
+pub use calibrate::{Progress as CalibrationProgress, Watch as CalibrationWatch};
 pub use data_step::{DataStep, Progress, progress};
 pub use priors::{Call, Denoiser, Estimate, Prior, PriorError, Tv, Wnnm};
 pub use run::{BackOff, HoldOut, IterInfo, Observer, Outcome, Plan, SolveError, Stage, StopReason, StopRule, run};

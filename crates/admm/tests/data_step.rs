@@ -6,7 +6,7 @@ use ndarray::{
 };
 use proptest::prelude::*;
 use sci_forward::testing::{gaussian, mask_families, moving_square, uniform};
-use sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+use sci_forward::{MaskOperator, MaskStack, Measurement, Noise, SensingOperator, VideoShape};
 use std::sync::Arc;
 
 /// Masks by the definition of H, with nothing told of masks: the data step takes its general path.
@@ -73,18 +73,21 @@ proptest! {
 
     #[test]
     fn the_fused_step_equals_the_definition(
-        shape in shapes(), seed in any::<u64>(), damping in prop_oneof![Just(0f32), 0.01f32..2.0], hole in any::<bool>()
+        shape in shapes(), seed in any::<u64>(), damping in prop_oneof![Just(0f32), 0.01f32..2.0], hole in any::<bool>(),
+        (noisy, precision, hold_momentum) in (any::<bool>(), 0f32..100.0, any::<bool>())
     ) {
+        let noise = noisy.then(|| Noise::new(Some(50.0), 0.1).unwrap());
         for masks in mask_families(shape, seed) {
             let (x, y) = (uniform(shape.dim(), seed), gaussian(shape.image_dim(), seed + 1));
             let (previous, z) = (uniform(shape.dim(), seed + 2), uniform(shape.dim(), seed + 3));
-            let ways = both_ways(masks, &y, hole);
+            let ways = both_ways(masks, &y, hole).map(|measurement| measurement.with_noise(noise));
             for kind in 0..3 {
                 let step = |measurement: &Measurement| {
                     let (mut to, mut y1) = (x.mapv(|_| f32::NAN), y.mapv(|v| v * 0.5));
                     let momentum = (kind == 1).then_some(&mut y1);
                     let mirror = (kind == 2).then(|| z.view());
-                    let step = DataStep { damping, momentum, mirror, previous: Some(previous.view()) };
+                    let previous = Some(previous.view());
+                    let step = DataStep { damping, precision, momentum, hold_momentum, mirror, previous };
                     let progress = step.apply(measurement, x.view(), to.view_mut());
                     (to, y1, progress)
                 };
@@ -98,6 +101,22 @@ proptest! {
             let [fast, slow] = ways.each_ref().map(|measurement| progress(measurement, x.view(), previous.view()));
             prop_assert!(close(fast, slow), "{fast:?} {slow:?}");
         }
+    }
+
+    /// The gradient of `Σ (y − H x)²/n + ‖x − v‖²/s²` is 0 where the step goes.
+    #[test]
+    fn with_noise_the_step_goes_to_the_likeliest_video(shape in shapes(), seed in any::<u64>(), s2 in 1e-4f32..1.0) {
+        let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.9, seed).unwrap()));
+        let y = operator.forward(uniform(shape.dim(), seed).view());
+        let measurement = Measurement::new(operator.clone(), y.clone()).unwrap();
+        let measurement = measurement.with_noise(Some(Noise::new(Some(20.0), 0.05).unwrap()));
+        let v = uniform(shape.dim(), seed + 1);
+        let mut x = v.clone();
+        DataStep { precision: 1.0 / s2, ..DataStep::default() }.apply(&measurement, v.view(), x.view_mut());
+        let weighted = (&y - operator.forward(x.view())) / measurement.variance().unwrap();
+        let gradient = (&x - &v) / s2 - operator.adjoint(weighted.view());
+        let scale = 1.0 / s2 + weighted.iter().fold(0f32, |m, w| m.max(w.abs()));
+        prop_assert!(gradient.iter().all(|g| g.abs() < 1e-4 * scale), "{gradient}");
     }
 
     #[test]

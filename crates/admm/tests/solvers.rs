@@ -404,3 +404,28 @@ fn every_iteration_turns_the_video_another_way_round_and_back() {
         seen.push(found);
     }
 }
+
+/// With strong noise, a solver that knows of it is far better than one that does not; with none, nothing changes.
+#[test]
+fn noise_that_is_known_is_not_reconstructed() {
+    let shape = VideoShape { frames: 6, height: 48, width: 48 };
+    let truth = moving_square(shape);
+    let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap()));
+    let y = operator.forward(truth.view());
+    let solve = |measurement: &Measurement| {
+        let plan = Plan::new([Stage { sigma: None, iterations: 30 }]);
+        let outcome = run(&mut Gap::accelerated(Tv::new(0.15)), measurement, Start::Mean, &plan, &mut ()).unwrap();
+        outcome.estimate.sensor
+    };
+    let error = |x: &ndarray::Array3<f32>| (x - &truth).mapv(|d| d * d).mean().unwrap();
+    for sigma in [0.2, 0.4] {
+        let noise = sci_forward::Noise::new(None, sigma).unwrap();
+        let unaware = Measurement::new(operator.clone(), noise.apply(y.view(), 3)).unwrap();
+        let aware = unaware.clone().with_noise(Some(noise));
+        let [unaware, aware] = [&unaware, &aware].map(|measurement| error(&solve(measurement)));
+        assert!(aware < 0.8 * unaware, "σ = {sigma}: {aware} with, {unaware} without");
+    }
+    let clean = Measurement::new(operator, y).unwrap();
+    let silent = clean.clone().with_noise(Some(sci_forward::Noise::new(None, 0.0).unwrap()));
+    assert_eq!(solve(&clean), solve(&silent));
+}

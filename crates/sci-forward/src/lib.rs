@@ -38,6 +38,7 @@ mod masked;
 mod masks;
 mod measurement;
 pub mod metrics;
+mod mismatch;
 mod noise;
 mod operator;
 #[cfg(any(test, feature = "testing"))]
@@ -47,6 +48,7 @@ pub use bayer::{CfaPattern, Demosaicer};
 pub use masked::{BinaryMasks, Gained, MaskOperator, MaskSource, ShiftingMasks};
 pub use masks::{MaskError, MaskStack};
 pub use measurement::{Measurement, MeasurementError};
+pub use mismatch::MaskMismatch;
 pub use noise::{Noise, NoiseError};
 pub use operator::{Restricted, SensingOperator};
 

@@ -2,7 +2,7 @@
 
 use crate::bayer::{mosaic_adjoint_into, mosaic_into};
 use crate::operator::close;
-use crate::{CfaPattern, Restricted, SensingOperator, VideoShape};
+use crate::{CfaPattern, Noise, Restricted, SensingOperator, VideoShape};
 use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView4, Axis, Zip};
 use std::sync::Arc;
 
@@ -58,6 +58,8 @@ pub struct Measurement {
     y: Array2<f32>,
     cfa: Option<CfaPattern>,
     scale: f64,
+    /// Of each pixel of y, where noise is known of.
+    variance: Option<Array2<f32>>,
 }
 
 impl Measurement {
@@ -83,12 +85,35 @@ impl Measurement {
             return Err(MeasurementError::AllClosed);
         }
         let scale = if squares > 0.0 { squares.sqrt() } else { (open as f64).sqrt() };
-        Ok(Self { operator, y, cfa: None, scale })
+        Ok(Self { operator, y, cfa: None, scale, variance: None })
     }
 
     /// The same measurement by a sensor with this color filter array; `None` for a gray sensor.
     pub fn with_cfa(self, cfa: Option<CfaPattern>) -> Self {
         Self { cfa, ..self }
+    }
+
+    /// The same measurement with noise that solvers are to know of: they then explain y as closely as the noise allows, not exactly. The
+    /// shot noise of a pixel is that of its measured light. Noise that has no variance anywhere is none.
+    ///
+    /// ```
+    /// use ndarray::{Array3, array};
+    /// use sci_forward::{MaskOperator, MaskStack, Measurement, Noise};
+    /// use std::sync::Arc;
+    ///
+    /// let h = Arc::new(MaskOperator::new(MaskStack::new(Array3::ones((2, 1, 2)))?));
+    /// let measurement = Measurement::new(h, array![[1.0, 0.0]])?.with_noise(Some(Noise::new(Some(4.0), 0.5)?));
+    /// assert_eq!(measurement.variance(), Some(array![[0.5, 0.25]].view()));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn with_noise(self, noise: Option<Noise>) -> Self {
+        let variance = noise.map(|noise| self.y.mapv(|y| noise.variance(y)));
+        Self { variance: variance.filter(|variance| variance.iter().any(|&v| v > 0.0)), ..self }
+    }
+
+    /// The variance of the noise of each pixel `[H, W]`, where noise is known of.
+    pub fn variance(&self) -> Option<ArrayView2<'_, f32>> {
+        self.variance.as_ref().map(|variance| variance.view())
     }
 
     /// `H`.
@@ -149,7 +174,7 @@ impl Measurement {
         check("map of measured pixels", measured.shape(), self.shape().image_dim().into())?;
         let y = Zip::from(&self.y).and(measured).map_collect(|&y, &keep| if keep { y } else { 0.0 });
         let operator = Arc::new(Restricted::new(self.operator.clone(), measured));
-        Ok(Self::new(operator, y)?.with_cfa(self.cfa))
+        Ok(Self { cfa: self.cfa, variance: self.variance.clone(), ..Self::new(operator, y)? })
     }
 
     /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`, 0 at the pixels that are not open.

@@ -60,6 +60,18 @@ impl Noise {
         Ok(Self { photons, sigma })
     }
 
+    /// The variance of a measurement of `y`: `max(y, 0) / photons + sigma²`.
+    ///
+    /// ```
+    /// let noise = sci_forward::Noise::new(Some(100.0), 0.1)?;
+    /// assert!((noise.variance(2.0) - 0.03).abs() < 1e-7 && (noise.variance(-1.0) - 0.01).abs() < 1e-7);
+    /// # Ok::<(), sci_forward::NoiseError>(())
+    /// ```
+    pub fn variance(&self, y: f32) -> f32 {
+        let shot = self.photons.map_or(0.0, |photons| f64::from(y.max(0.0)) / photons);
+        (shot + self.sigma * self.sigma) as f32
+    }
+
     /// The noisy measurement `[H, W]`, the same for the same `seed`.
     ///
     /// Shot noise draws from `seed` and read noise from `seed + 1`: one of them alone is what it is in the sum of both.

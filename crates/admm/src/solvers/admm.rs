@@ -43,7 +43,7 @@ impl<P: Prior> Admm<P> {
     fn data_step(&mut self, measurement: &Measurement, previous: &Estimate, theta: &Estimate) -> Progress {
         let Self { gamma, z, next_z, .. } = self;
         let previous = Some(previous.sensor.view());
-        let step = DataStep { damping: *gamma, mirror: Some(z.view()), previous, momentum: None };
+        let step = DataStep { damping: *gamma, mirror: Some(z.view()), previous, ..DataStep::default() };
         let progress = step.apply(measurement, theta.sensor.view(), next_z.view_mut());
         std::mem::swap(z, next_z);
         progress

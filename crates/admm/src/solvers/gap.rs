@@ -1,7 +1,7 @@
 //! Generalised alternating projection.
 
-use crate::{Call, DataStep, Estimate, Prior, PriorError, Progress, Solver};
-use ndarray::{Array2, Array3};
+use crate::{Call, DataStep, Estimate, Prior, PriorError, Progress, Solver, progress};
+use ndarray::{Array2, Array3, Zip};
 use sci_forward::Measurement;
 
 /// Where the accumulated measurement `y1` of accelerated GAP starts.
@@ -19,6 +19,10 @@ pub enum MomentumStart {
 /// plain        x ← v + Hᵀ (y − H v) / diag(H Hᵀ)                              v ← D_σ(x)
 /// accelerated  y1 ← y1 + (y − H v);  x ← v + Hᵀ (y1 − H v) / diag(H Hᵀ)       v ← D_σ(x)
 /// ```
+///
+/// Where noise of variance n is known of ([`Measurement::with_noise`]), x is the likeliest video instead of the projection:
+/// diag(H Hᵀ) becomes diag(H Hᵀ) + n / mse(v), the error of v being what its residual has beyond the noise, and y1 stays as it is
+/// once the residual is within the noise, which it would add up.
 ///
 /// The estimate is `v`, not clipped. On a color sensor x and v are mosaics, and the prior knows an RGB video behind v.
 ///
@@ -66,10 +70,16 @@ impl<P: Prior> Gap<P> {
         Self { restarts: true, ..self }
     }
 
-    /// The x of the next iteration from the v of this one. It reads v once for the projection and for how far v has come.
+    /// The x of the next iteration from the v of this one. Without noise it reads v once for the projection and for how far v has come.
     fn project(&mut self, measurement: &Measurement, previous: &Estimate, v: &Estimate) -> Progress {
-        let step =
-            DataStep { momentum: self.y1.as_mut(), previous: Some(previous.sensor.view()), ..DataStep::default() };
+        let known = Known::of(measurement, v);
+        let step = DataStep {
+            momentum: self.y1.as_mut(),
+            hold_momentum: known.is_some_and(|known| known.within_noise),
+            precision: known.map_or(0.0, |known| known.precision),
+            previous: Some(previous.sensor.view()),
+            ..DataStep::default()
+        };
         step.apply(measurement, v.sensor.view(), self.x.view_mut())
     }
 
@@ -85,6 +95,31 @@ impl<P: Prior> Gap<P> {
             y1.assign(&measurement.y());
             DataStep::default().apply(measurement, v.sensor.view(), self.x.view_mut());
         }
+    }
+}
+
+/// How well v is known, from its residual and the noise: `Σ r² ≈ Σ n + mse · Σ diag(H Hᵀ)` over the open pixels.
+#[derive(Clone, Copy)]
+struct Known {
+    /// 1 / mse.
+    precision: f32,
+    /// Whether noise alone would leave as large a residual.
+    within_noise: bool,
+}
+
+/// The least mean square error that a video is taken to have, 52 dB: the residual of one that has nearly as much as the noise alone says no
+/// more.
+const LEAST_ERROR: f64 = 6e-6;
+
+impl Known {
+    fn of(measurement: &Measurement, v: &Estimate) -> Option<Self> {
+        let (variance, gram) = (measurement.variance()?, measurement.operator().gram());
+        let (noise, open) = Zip::from(variance).and(gram).fold((0f64, 0f64), |(noise, open), &n, &gram| {
+            if gram > 0.0 { (noise + f64::from(n), open + f64::from(gram)) } else { (noise, open) }
+        });
+        let residual = progress(measurement, v.sensor.view(), v.sensor.view()).residual;
+        let error = ((residual - noise) / open).max(LEAST_ERROR);
+        Some(Self { precision: (1.0 / error) as f32, within_noise: residual <= noise })
     }
 }
 

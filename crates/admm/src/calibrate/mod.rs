@@ -1,0 +1,281 @@
+//! How the masks really sit, from measurements alone.
+//!
+//! Some pixels of each measurement are held out; the others are solved by a few iterations of GAP-TV with masks that are moved, turned,
+//! blended … as [`MaskMismatch`] says, and with a black level taken off. The mismatch with which the video predicts the held-out pixels best
+//! is the one that is there: `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
+//!
+//! A shift is looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in
+//! turn by parabolas through three values, with steps that shrink. What the data cannot tell stays as it was told: a parameter whose
+//! value is less than twice its uncertainty from that.
+
+mod search;
+
+use crate::{Gap, PerLattice, Plan, Prior, SolveError, Stage, Start, Tv, run};
+use ndarray::{Array2, ArrayView2, Zip};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sci_forward::{CfaPattern, MaskError, MaskMismatch, MaskOperator, MaskStack, Measurement, MeasurementError};
+use search::Search;
+use std::ops::ControlFlow;
+use std::sync::Arc;
+
+/// Weight and iterations of the fast solve.
+const TV_WEIGHT: f32 = 0.15;
+const ITERATIONS: usize = 16;
+/// Held-out pixels fall into so many groups; each has a best value of its own, and their spread is the uncertainty.
+const GROUPS: usize = 16;
+
+/// What may be wrong with the masks, and how far it is looked for.
+///
+/// ```
+/// use admm::Calibration;
+/// use admm::sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
+/// use ndarray::Array3;
+///
+/// let shape = VideoShape { frames: 4, height: 32, width: 32 };
+/// let square = |(t, i, j)| if (8..20).contains(&i) && (8 + t..20 + t).contains(&j) { 0.9 } else { 0.1 };
+/// let told = MaskStack::random(shape, 0.5, 0)?;
+/// let real = MaskMismatch { shift: [0.5, 0.0], ..MaskMismatch::default() }.apply(&told)?;
+/// let y = MaskOperator::new(real).forward(Array3::from_shape_fn(shape.dim(), square).view());
+///
+/// let shifts = Calibration { rotation: false, scale: false, clock: false, contrast: false, ends: false, black: false, ..Calibration::default() };
+/// let found = shifts.find(&told, None, &[y], &mut |_| std::ops::ControlFlow::Continue(()))?;
+/// assert!((found.mismatch.shift[0] - 0.5).abs() < 0.1, "{found:?}");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct Calibration {
+    /// Farthest shift in pixels, either way, 0 to 16; 0 looks for none.
+    pub reach: f64,
+    /// Whether the masks may be turned.
+    pub rotation: bool,
+    /// Whether they may be larger or smaller.
+    pub scale: bool,
+    /// Whether the frame before or after is seen.
+    pub clock: bool,
+    /// Whether they have less contrast.
+    pub contrast: bool,
+    /// Whether light falls in before the first and after the last frame.
+    pub ends: bool,
+    /// Whether y has a black level.
+    pub black: bool,
+    /// One pixel in so many is held out, 2 or more.
+    pub spacing: usize,
+    /// Of the draw.
+    pub seed: u64,
+}
+
+impl Default for Calibration {
+    fn default() -> Self {
+        Self {
+            reach: 2.0,
+            rotation: true,
+            scale: true,
+            clock: true,
+            contrast: true,
+            ends: true,
+            black: true,
+            spacing: 10,
+            seed: 0,
+        }
+    }
+}
+
+/// A parameter that was looked for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// `shift down`, `shift right`, `rotation`, `scale`, `clock`, `contrast`, `first end`, `last end`, `black level`.
+    pub name: &'static str,
+    /// Its value: pixels, pixels, degrees, 1, share, share, share of the mean transmittance twice, share of the mean of y.
+    pub value: f64,
+    /// One standard deviation; infinite if the error does not depend on it.
+    pub uncertainty: f64,
+    /// Whether the value differs from what was told by more than the data leave open; else it is what was told.
+    pub told_apart: bool,
+    /// Values that were tried, and E of them, in the order of values.
+    pub curve: Vec<(f64, f64)>,
+}
+
+/// What was found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Calibrated {
+    /// How the masks differ from those that were told.
+    pub mismatch: MaskMismatch,
+    /// To be taken off y, in its unit.
+    pub black: f64,
+    /// E with the masks as told, and as found.
+    pub error: [f64; 2],
+    /// All that was looked for.
+    pub parameters: Vec<Parameter>,
+    /// Solves that it took.
+    pub solves: usize,
+}
+
+/// Why there is no calibration.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CalibrateError {
+    /// A setting is out of range.
+    #[error("{key} = {value}: it must be {legal}")]
+    Setting {
+        /// Its name.
+        key: &'static str,
+        /// Its value.
+        value: f64,
+        /// What is legal.
+        legal: &'static str,
+    },
+    /// There is nothing to calibrate with.
+    #[error("there is no measurement to calibrate with")]
+    Empty,
+    /// The masks.
+    #[error(transparent)]
+    Mask(#[from] MaskError),
+    /// A measurement.
+    #[error(transparent)]
+    Measurement(#[from] MeasurementError),
+    /// The fast solve.
+    #[error(transparent)]
+    Solve(#[from] SolveError),
+    /// The caller wished to stop.
+    #[error("stopped")]
+    Stopped,
+}
+
+/// How far the search is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Progress {
+    /// Solves so far.
+    pub solves: usize,
+    /// About how many there will be.
+    pub expected: usize,
+    /// The least error so far.
+    pub error: f64,
+}
+
+/// Told of each step of the search.
+pub type Watch<'w> = dyn FnMut(Progress) -> ControlFlow<()> + 'w;
+
+impl Calibration {
+    /// Looks for the mismatch of `masks` with which all `measurements` `[H, W]` are explained best.
+    ///
+    /// # Errors
+    /// [`CalibrateError`] for a setting out of range, measurements that do not fit the masks, or when `watch` breaks off.
+    pub fn find(
+        &self,
+        masks: &MaskStack,
+        cfa: Option<CfaPattern>,
+        measurements: &[Array2<f32>],
+        watch: &mut Watch<'_>,
+    ) -> Result<Calibrated, CalibrateError> {
+        let setting = |key, value, legal, ok: bool| {
+            if ok { Ok(()) } else { Err(CalibrateError::Setting { key, value, legal }) }
+        };
+        setting("reach", self.reach, "0 to 16 pixels", (0.0..=16.0).contains(&self.reach))?;
+        setting("spacing", self.spacing as f64, "at least 2", self.spacing >= 2)?;
+        if measurements.is_empty() {
+            return Err(CalibrateError::Empty);
+        }
+        let judge = Judge::new(masks, cfa, measurements, self)?;
+        Search::new(judge, self, watch).run()
+    }
+}
+
+/// Values of all parameters, those that are not looked for as told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Point {
+    mismatch: MaskMismatch,
+    /// In units of the mean of y.
+    black: f64,
+}
+
+/// Errors of the held-out pixels, group by group.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Errors([f64; GROUPS]);
+
+impl Errors {
+    fn total(&self) -> f64 {
+        self.0.iter().sum()
+    }
+}
+
+/// What a mismatch is judged by.
+struct Judge<'a> {
+    masks: &'a MaskStack,
+    cfa: Option<CfaPattern>,
+    measurements: &'a [Array2<f32>],
+    /// The group of a held-out pixel.
+    groups: Array2<Option<u8>>,
+    /// Mean of y, and of the masks.
+    level: f64,
+    transmittance: f64,
+    /// Σ y² over the held-out pixels.
+    power: f64,
+}
+
+impl<'a> Judge<'a> {
+    fn new(
+        masks: &'a MaskStack,
+        cfa: Option<CfaPattern>,
+        measurements: &'a [Array2<f32>],
+        settings: &Calibration,
+    ) -> Result<Self, CalibrateError> {
+        let operator = Arc::new(MaskOperator::new(masks.clone()));
+        for y in measurements {
+            Measurement::new(operator.clone(), y.clone())?;
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
+        let share = 1.0 / settings.spacing as f64;
+        let groups = Array2::from_shape_simple_fn(masks.shape().image_dim(), || {
+            let group = rng.random_range(0..GROUPS) as u8;
+            (rng.random::<f64>() < share).then_some(group)
+        });
+        let held_out = |y: &Array2<f32>| {
+            Zip::from(y).and(&groups).fold(0.0, |sum, &y, group| sum + group.map_or(0.0, |_| f64::from(y).powi(2)))
+        };
+        let power = measurements.iter().map(held_out).sum::<f64>().max(f64::MIN_POSITIVE);
+        let mean = |values: &mut dyn Iterator<Item = f32>, count: usize| {
+            values.map(f64::from).sum::<f64>() / count.max(1) as f64
+        };
+        let pixels = measurements.iter().map(Array2::len).sum();
+        let level = mean(&mut measurements.iter().flatten().copied(), pixels);
+        let transmittance = mean(&mut masks.view().iter().copied(), masks.view().len());
+        Ok(Self { masks, cfa, measurements, groups, level, transmittance, power })
+    }
+
+    /// E of a mismatch, shared out among the groups.
+    fn errors(&self, point: &Point) -> Result<Errors, CalibrateError> {
+        let masks = self.in_units(point).mismatch.apply(self.masks)?;
+        let operator = Arc::new(MaskOperator::new(masks));
+        let black = (point.black * self.level) as f32;
+        let stays = self.groups.mapv(|group| group.is_none());
+        let mut errors = [0.0; GROUPS];
+        for y in self.measurements {
+            let whole = Measurement::new(operator.clone(), y.mapv(|y| y - black))?.with_cfa(self.cfa);
+            let predicted = self.predicted(&whole, stays.view())?;
+            Zip::from(&self.groups).and(whole.y()).and(&predicted).for_each(|group, &y, &hx| {
+                if let Some(group) = group {
+                    errors[usize::from(*group)] += f64::from(y - hx).powi(2) / self.power;
+                }
+            });
+        }
+        Ok(Errors(errors))
+    }
+
+    /// With the ends in the unit of the masks.
+    fn in_units(&self, point: &Point) -> Point {
+        let mut point = *point;
+        point.mismatch.ends = point.mismatch.ends.map(|end| end * self.transmittance);
+        point
+    }
+
+    /// H x of the whole sensor, x solved without the pixels held out.
+    fn predicted(&self, whole: &Measurement, stays: ArrayView2<'_, bool>) -> Result<Array2<f32>, CalibrateError> {
+        let given = whole.restricted(stays)?;
+        let tv = Tv::new(TV_WEIGHT);
+        let prior: Box<dyn Prior> = if self.cfa.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) };
+        let plan = Plan::new([Stage { sigma: None, iterations: ITERATIONS }]);
+        let outcome = run(&mut Gap::accelerated(prior), &given, Start::Mean, &plan, &mut ())?;
+        Ok(whole.operator().forward(outcome.estimate.sensor.view()))
+    }
+}

@@ -1,0 +1,253 @@
+//! From a grid of shifts to parabolas in each parameter.
+
+use super::{CalibrateError, Calibrated, Calibration, Errors, GROUPS, Judge, Parameter, Point, Progress, Watch};
+use sci_forward::MaskMismatch;
+use std::ops::RangeInclusive;
+
+/// Rounds through all parameters.
+const ROUNDS: usize = 6;
+/// Standard deviations by which a value must differ from what was told.
+const APART: f64 = 2.0;
+
+/// A coordinate of the search.
+#[derive(Clone, Copy)]
+struct Axis {
+    name: &'static str,
+    get: fn(&Point) -> f64,
+    set: fn(&mut Point, f64),
+    /// The first step.
+    step: f64,
+    range: (f64, f64),
+}
+
+/// All axes that the settings ask for, shifts first.
+fn axes(settings: &Calibration) -> Vec<Axis> {
+    let axis = |wanted: bool, name, step, range: RangeInclusive<f64>, get, set| {
+        wanted.then_some(Axis { name, get, set, step, range: (*range.start(), *range.end()) })
+    };
+    let (shifts, reach) = (settings.reach > 0.0, -settings.reach..=settings.reach);
+    let all = [
+        axis(shifts, "shift down", 0.5, reach.clone(), |p| p.mismatch.shift[0], |p, v| p.mismatch.shift[0] = v),
+        axis(shifts, "shift right", 0.5, reach, |p| p.mismatch.shift[1], |p, v| p.mismatch.shift[1] = v),
+        axis(settings.rotation, "rotation", 0.1, -2.0..=2.0, |p| p.mismatch.rotation, |p, v| p.mismatch.rotation = v),
+        axis(settings.scale, "scale", 2e-3, 0.97..=1.03, |p| p.mismatch.scale, |p, v| p.mismatch.scale = v),
+        axis(settings.clock, "clock", 0.05, -0.5..=0.5, |p| p.mismatch.clock, |p, v| p.mismatch.clock = v),
+        axis(settings.contrast, "contrast", 0.05, 0.3..=1.5, |p| p.mismatch.contrast, |p, v| p.mismatch.contrast = v),
+        axis(settings.ends, "first end", 0.1, -0.5..=2.0, |p| p.mismatch.ends[0], |p, v| p.mismatch.ends[0] = v),
+        axis(settings.ends, "last end", 0.1, -0.5..=2.0, |p| p.mismatch.ends[1], |p, v| p.mismatch.ends[1] = v),
+        axis(settings.black, "black level", 0.01, -0.3..=0.5, |p| p.black, |p, v| p.black = v),
+    ];
+    all.into_iter().flatten().collect()
+}
+
+/// The state of a search.
+pub(super) struct Search<'s> {
+    judge: Judge<'s>,
+    watch: &'s mut Watch<'s>,
+    axes: Vec<Axis>,
+    reach: f64,
+    best: Point,
+    best_errors: Errors,
+    solves: usize,
+    curves: Vec<Vec<(f64, f64)>>,
+}
+
+impl<'s> Search<'s> {
+    pub(super) fn new(judge: Judge<'s>, settings: &Calibration, watch: &'s mut Watch<'s>) -> Self {
+        let axes = axes(settings);
+        let told = Point { mismatch: MaskMismatch::default(), black: 0.0 };
+        Self {
+            judge,
+            watch,
+            reach: settings.reach,
+            curves: vec![Vec::new(); axes.len()],
+            axes,
+            best: told,
+            best_errors: Errors([f64::INFINITY; GROUPS]),
+            solves: 0,
+        }
+    }
+
+    pub(super) fn run(mut self) -> Result<Calibrated, CalibrateError> {
+        let told = self.best;
+        self.best_errors = self.errors(&told)?;
+        let first = self.best_errors.total();
+        self.grid()?;
+        let mut steps: Vec<f64> = self.axes.iter().map(|axis| axis.step).collect();
+        for _ in 0..ROUNDS {
+            for i in 0..self.axes.len() {
+                steps[i] = self.descend(i, steps[i])?;
+            }
+        }
+        let uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
+        let apart = self.leave_as_told(&told, &uncertainties)?;
+        let parameters = self.parameters(&uncertainties, &apart);
+        let found = self.judge.in_units(&self.best);
+        Ok(Calibrated {
+            mismatch: found.mismatch,
+            black: found.black * self.judge.level,
+            error: [first, self.best_errors.total()],
+            parameters,
+            solves: self.solves,
+        })
+    }
+
+    fn expected(&self) -> usize {
+        let side = 2 * self.reach.floor() as usize + 1;
+        side * side + (3 * ROUNDS + 4) * self.axes.len()
+    }
+
+    fn errors(&mut self, point: &Point) -> Result<Errors, CalibrateError> {
+        let errors = self.judge.errors(point)?;
+        self.solves += 1;
+        let error = self.best_errors.total().min(errors.total());
+        let progress = Progress { solves: self.solves, expected: self.expected().max(self.solves), error };
+        match (self.watch)(progress) {
+            std::ops::ControlFlow::Continue(()) => Ok(errors),
+            std::ops::ControlFlow::Break(()) => Err(CalibrateError::Stopped),
+        }
+    }
+
+    /// Tries a point, and goes there if it is better.
+    fn try_point(&mut self, point: Point) -> Result<Errors, CalibrateError> {
+        let errors = self.errors(&point)?;
+        if errors.total() < self.best_errors.total() {
+            (self.best, self.best_errors) = (point, errors);
+        }
+        Ok(errors)
+    }
+
+    /// Whole pixels, all within reach.
+    fn grid(&mut self) -> Result<(), CalibrateError> {
+        let most = self.reach.floor() as i32;
+        let told = self.best;
+        for (down, right) in (-most..=most).flat_map(|down| (-most..=most).map(move |right| (down, right))) {
+            if (down, right) != (0, 0) {
+                let mut point = told;
+                point.mismatch.shift = [down.into(), right.into()];
+                self.try_point(point)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn with(&self, axis: usize, value: f64) -> Point {
+        let mut point = self.best;
+        let Axis { set, range: (least, most), .. } = self.axes[axis];
+        set(&mut point, value.clamp(least, most));
+        point
+    }
+
+    /// To the minimum of the parabola through the errors at the best value and two others, to either side where the range allows; returns
+    /// the next step.
+    fn descend(&mut self, axis: usize, step: f64) -> Result<f64, CalibrateError> {
+        let Axis { get, range: (least, most), .. } = self.axes[axis];
+        let at = get(&self.best);
+        let mut points = vec![(at, self.best_errors.total())];
+        for value in two_beside(at, step, least, most) {
+            let point = self.with(axis, value);
+            points.push((get(&point), self.look(axis, point)?.total()));
+        }
+        let moved = get(&self.best) != at;
+        let lowest = vertex([points[0], points[1], points[2]]);
+        match lowest.filter(|lowest| (lowest - at).abs() <= step) {
+            // Near: the next step is as small as what is left to find.
+            Some(lowest) => {
+                let point = self.with(axis, lowest);
+                self.look(axis, point)?;
+                Ok(0.5 * step)
+            }
+            // Beyond: go on from the better side, with longer steps.
+            None if moved => Ok(1.5 * step),
+            None => Ok(0.5 * step),
+        }
+    }
+
+    /// Tries a point on an axis.
+    fn look(&mut self, axis: usize, point: Point) -> Result<Errors, CalibrateError> {
+        let errors = self.try_point(point)?;
+        self.curves[axis].push(((self.axes[axis].get)(&point), errors.total()));
+        Ok(errors)
+    }
+
+    /// Each group of pixels has a parabola of its own; the spread of their minima, by the root of their number.
+    fn uncertainty(&mut self, axis: usize) -> Result<f64, CalibrateError> {
+        let (at, step) = ((self.axes[axis].get)(&self.best), self.axes[axis].step);
+        let middle = self.best_errors;
+        let (below, above) = (self.errors(&self.with(axis, at - step))?, self.errors(&self.with(axis, at + step))?);
+        let curvature = |g: usize| below.0[g] - 2.0 * middle.0[g] + above.0[g];
+        let total: f64 = (0..GROUPS).map(curvature).sum();
+        if total <= 0.0 {
+            return Ok(f64::INFINITY);
+        }
+        // The minimum of all is moved by each group's slope over the curvature of all.
+        let slopes: Vec<f64> = (0..GROUPS).map(|g| 0.5 * (above.0[g] - below.0[g])).collect();
+        let mean = slopes.iter().sum::<f64>() / GROUPS as f64;
+        let variance = slopes.iter().map(|slope| (slope - mean).powi(2)).sum::<f64>() / (GROUPS - 1) as f64;
+        Ok(step * (GROUPS as f64 * variance).sqrt() / total)
+    }
+
+    /// Puts parameters back that do not differ from what was told by more than the data leave open; which do.
+    fn leave_as_told(&mut self, told: &Point, uncertainties: &[f64]) -> Result<Vec<bool>, CalibrateError> {
+        let differs = |(axis, uncertainty): (&Axis, &f64)| {
+            ((axis.get)(&self.best) - (axis.get)(told)).abs() > APART * uncertainty
+        };
+        let apart: Vec<bool> = self.axes.iter().zip(uncertainties).map(differs).collect();
+        let mut point = self.best;
+        for (axis, _) in self.axes.iter().zip(&apart).filter(|(_, apart)| !**apart) {
+            (axis.set)(&mut point, (axis.get)(told));
+        }
+        if point != self.best {
+            self.best_errors = self.errors(&point)?;
+            self.best = point;
+        }
+        Ok(apart)
+    }
+
+    fn parameters(&mut self, uncertainties: &[f64], apart: &[bool]) -> Vec<Parameter> {
+        let curves = std::mem::take(&mut self.curves);
+        let all = self.axes.iter().zip(uncertainties).zip(apart).zip(curves);
+        all.map(|(((axis, &uncertainty), &told_apart), mut curve)| {
+            curve.sort_by(|a, b| a.0.total_cmp(&b.0));
+            Parameter { name: axis.name, value: (axis.get)(&self.best), uncertainty, told_apart, curve }
+        })
+        .collect()
+    }
+}
+
+/// The values a step below and above, both on the other side where one would be out of range.
+fn two_beside(at: f64, step: f64, least: f64, most: f64) -> [f64; 2] {
+    match (at - step >= least, at + step <= most) {
+        (true, false) => [at - 2.0 * step, at - step],
+        (false, true) => [at + step, at + 2.0 * step],
+        _ => [at - step, at + step],
+    }
+}
+
+/// Where the parabola through three points has its minimum, if it has one.
+fn vertex([(a, fa), (b, fb), (c, fc)]: [(f64, f64); 3]) -> Option<f64> {
+    let (slope_b, slope_c) = ((fb - fa) / (b - a), (fc - fa) / (c - a));
+    let curvature = (slope_b - slope_c) / (b - c);
+    (curvature > 0.0 && curvature.is_finite()).then(|| 0.5 * (a + b - slope_b / curvature))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_parabola_has_its_minimum_where_it_is() {
+        let at = |x: f64| (x, 3.0 * (x - 0.3).powi(2) + 1.0);
+        assert!((vertex([at(0.5), at(-1.0), at(2.0)]).unwrap() - 0.3).abs() < 1e-12);
+        assert_eq!(vertex([(0.0, 1.0), (-1.0, 1.0), (1.0, 1.0)]), None);
+        assert_eq!(vertex([(0.0, 1.0), (-1.0, 0.0), (1.0, 0.0)]), None);
+        assert_eq!(vertex([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0)]), None);
+    }
+
+    #[test]
+    fn values_stay_in_range() {
+        assert_eq!(two_beside(0.0, 0.5, -1.0, 1.0), [-0.5, 0.5]);
+        assert_eq!(two_beside(1.0, 0.5, -1.0, 1.0), [0.0, 0.5]);
+        assert_eq!(two_beside(-0.75, 0.5, -1.0, 1.0), [-0.25, 0.25]);
+    }
+}

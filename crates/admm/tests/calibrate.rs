@@ -1,0 +1,95 @@
+//! Masks that sit elsewhere than they were told to, found from measurements alone.
+
+use admm::sci_forward::testing::moving_square;
+use admm::sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
+use admm::{CalibrateError, Calibrated, Calibration};
+use ndarray::{Array2, Array3};
+use std::ops::ControlFlow;
+
+const SHAPE: VideoShape = VideoShape { frames: 4, height: 48, width: 48 };
+
+/// Three scenes that have little in common.
+fn scenes() -> [Array3<f32>; 3] {
+    let waves = |(t, i, j): (usize, usize, usize)| {
+        0.5 + 0.25 * (0.3 * i as f32 + 0.5 * t as f32).sin() + 0.2 * (0.23 * j as f32 - 0.2 * t as f32).cos()
+    };
+    let steps = |(t, i, j): (usize, usize, usize)| ((i / 12 + (j + t) / 16) % 3) as f32 / 3.0 + 0.1;
+    [moving_square(SHAPE), Array3::from_shape_fn(SHAPE.dim(), waves), Array3::from_shape_fn(SHAPE.dim(), steps)]
+}
+
+fn told() -> MaskStack {
+    MaskStack::random(SHAPE, 0.5, 3).unwrap()
+}
+
+fn measured(truth: &Array3<f32>, real: &MaskMismatch) -> Array2<f32> {
+    MaskOperator::new(real.apply(&told()).unwrap()).forward(truth.view())
+}
+
+/// Nothing but a shift, in few solves.
+fn shifts() -> Calibration {
+    Calibration {
+        reach: 1.0,
+        rotation: false,
+        scale: false,
+        clock: false,
+        contrast: false,
+        ends: false,
+        black: false,
+        ..Calibration::default()
+    }
+}
+
+fn find(settings: &Calibration, y: Array2<f32>) -> Calibrated {
+    settings.find(&told(), None, &[y], &mut |_| ControlFlow::Continue(())).unwrap()
+}
+
+#[test]
+fn a_shift_of_any_sign_is_found_in_every_scene() {
+    for (truth, shift) in scenes().iter().zip([[0.5, -0.3], [-0.4, 0.2], [0.25, 0.75]]) {
+        let found = find(&shifts(), measured(truth, &MaskMismatch { shift, ..MaskMismatch::default() }));
+        for axis in 0..2 {
+            let off = (found.mismatch.shift[axis] - shift[axis]).abs();
+            assert!(off < 0.05, "{shift:?}: {:?} after {} solves", found.mismatch.shift, found.solves);
+        }
+        assert!(found.error[1] < 0.5 * found.error[0], "{:?}", found.error);
+        assert!(found.parameters.iter().all(|p| p.told_apart), "{:?}", found.parameters);
+    }
+}
+
+#[test]
+fn masks_that_are_right_stay_as_they_are() {
+    for truth in scenes() {
+        let found = find(&shifts(), measured(&truth, &MaskMismatch::default()));
+        let kept = found.mismatch.shift.iter().zip(&found.parameters).all(|(s, p)| s.abs() <= 2.0 * p.uncertainty);
+        assert!(kept, "{:?}", found.parameters);
+        assert!(found.mismatch.shift.iter().all(|s| s.abs() < 0.05), "{:?}", found.mismatch.shift);
+    }
+}
+
+#[test]
+fn clock_and_black_level_are_found() {
+    let truth = &scenes()[0];
+    let y = measured(truth, &MaskMismatch { clock: 0.1, ..MaskMismatch::default() });
+    let found = find(&Calibration { reach: 0.0, clock: true, ..shifts() }, y);
+    let off = (found.mismatch.clock - 0.1).abs();
+    assert!(off < 0.05 && off < 2.0 * found.parameters[0].uncertainty, "{found:?}");
+    let y = measured(truth, &MaskMismatch::default()) + 0.1;
+    let found = find(&Calibration { reach: 0.0, black: true, ..shifts() }, y);
+    assert!((found.black - 0.1).abs() < 0.04, "{found:?}");
+}
+
+#[test]
+fn what_is_out_of_range_is_refused_and_a_stop_is_heard() {
+    let y = measured(&scenes()[0], &MaskMismatch::default());
+    let wrong = Calibration { reach: -1.0, ..shifts() };
+    let result = wrong.find(&told(), None, &[y.clone()], &mut |_| ControlFlow::Continue(()));
+    assert!(matches!(result, Err(CalibrateError::Setting { key: "reach", .. })));
+    let none = shifts().find(&told(), None, &[], &mut |_| ControlFlow::Continue(()));
+    assert!(matches!(none, Err(CalibrateError::Empty)));
+    let mut solves = 0;
+    let stopped = shifts().find(&told(), None, &[y], &mut |progress| {
+        solves = progress.solves;
+        if progress.solves == 3 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    assert!(matches!(stopped, Err(CalibrateError::Stopped)) && solves == 3);
+}
