@@ -446,7 +446,7 @@ mod tests {
         assert_eq!(problem("weight = 7\ncounts = 2"), unknown);
         assert_eq!(problem("weight = 7"), "a.toml:1: `weight` = 7 is not legal; legal: a number from 0 to 1");
         assert_eq!(problem("weight = 1"), "a.toml:1: `count` is missing; legal: 1 to 9");
-        assert_eq!(problem("count = 2\ninner.of = 1"), "a.toml:2: unknown key `inner.of`; legal here: on");
+        assert_eq!(problem("count = 2\ninner.other = 1"), "a.toml:2: unknown key `inner.other`; legal here: on");
         let (values, json) = read("count = 2", keys).unwrap();
         assert_eq!(values, (0.3, 2, true));
         assert_eq!(json, serde_json::json!({ "weight": 0.3, "count": 2, "inner": { "on": true } }));
