@@ -145,6 +145,10 @@ impl Layers for Ddnet {
         3
     }
 
+    fn multiply_adds(&self) -> f64 {
+        self.net.multiply_adds()
+    }
+
     fn convs(&self) -> Vec<&Conv> {
         self.net.convs()
     }

@@ -155,6 +155,10 @@ impl Layers for Fastdvdnet {
         self.spec.channels
     }
 
+    fn multiply_adds(&self) -> f64 {
+        self.net.multiply_adds()
+    }
+
     fn convs(&self) -> Vec<&Conv> {
         self.net.convs()
     }

@@ -226,6 +226,11 @@ impl Layers for Ffdnet {
         self.spec.channels
     }
 
+    /// All layers work at half the size.
+    fn multiply_adds(&self) -> f64 {
+        self.layers.iter().map(Conv::multiply_adds).sum::<f64>() / 4.0
+    }
+
     fn convs(&self) -> Vec<&Conv> {
         self.layers.iter().collect()
     }

@@ -123,6 +123,11 @@ impl Conv {
         Some(self.input_means.as_ref()?.get()?)
     }
 
+    /// Multiply-adds for each pixel of its result.
+    pub(crate) fn multiply_adds(&self) -> f64 {
+        self.weight.elem_count() as f64
+    }
+
     pub(crate) fn device(&self) -> &Device {
         self.weight.device()
     }

@@ -26,6 +26,9 @@ pub trait Layers: Send + Sync {
     /// Channels of a frame, `C`: 1 gray, 3 RGB.
     fn channels(&self) -> usize;
 
+    /// Multiply-adds of the convolutions of a call, for each pixel of each frame.
+    fn multiply_adds(&self) -> f64;
+
     #[doc(hidden)]
     fn convs(&self) -> Vec<&Conv>;
 

@@ -147,6 +147,19 @@ impl Block {
         Ok(Self { convs })
     }
 
+    /// Multiply-adds for each pixel of its result.
+    fn multiply_adds(&self) -> f64 {
+        let (mut pixels, mut sum) = (1.0, 0.0);
+        for (i, (conv, (_, stride, _))) in self.convs.iter().zip(LAYERS).enumerate() {
+            pixels /= (stride * stride) as f64;
+            sum += pixels * conv.multiply_adds();
+            if ONTO.iter().any(|(shuffled, _)| *shuffled == i) {
+                pixels *= 4.0;
+            }
+        }
+        sum
+    }
+
     /// `[N, 3(C + 1), H, W]` -> `[N, C, H, W]`, `H` and `W` multiples of 4.
     fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
         chain(&self.convs, &ONTO, x)
@@ -182,6 +195,11 @@ impl VideoNet {
     pub(crate) fn build(spec: BlockSpec, residual: Residual, ends: Ends, source: &mut Source<'_>) -> Result<Self> {
         let blocks = [Block::build(spec, "temp1", source)?, Block::build(spec, "temp2", source)?];
         Ok(Self { spec, residual, ends, blocks, cache: Cache::default() })
+    }
+
+    /// Multiply-adds for each pixel of each frame, which is the middle of one triplet in each stage. (Mirrored ends add one at each end.)
+    pub(crate) fn multiply_adds(&self) -> f64 {
+        self.blocks.iter().map(Block::multiply_adds).sum()
     }
 
     pub(crate) fn convs(&self) -> Vec<&Conv> {

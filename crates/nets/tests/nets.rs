@@ -63,6 +63,22 @@ const TOLERANCE: f32 = 1e-4;
 const ODD_SIZES: [(usize, usize); 6] = [(1, 1), (1, 9), (9, 1), (3, 5), (2, 6), (33, 31)];
 
 #[test]
+fn multiply_adds_are_those_of_all_layers() {
+    // Half the size: 5 → 64, 13 times 64 → 64, 64 → 4.
+    let ffdnet = Ffdnet::random(FfdnetSpec::GRAY, 0).unwrap();
+    assert_eq!(ffdnet.multiply_adds(), 9.0 * (5.0 * 64.0 + 13.0 * 64.0 * 64.0 + 64.0 * 4.0) / 4.0);
+    // For each pixel at full, half and quarter size; both stages.
+    let full = 9.0 * (2.0 * 90.0 + 90.0 * 32.0 + 32.0 * 32.0 + 32.0);
+    let half = 9.0 * (32.0 * 64.0 + 2.0 * 64.0 * 64.0 + 2.0 * 64.0 * 64.0 + 64.0 * 128.0);
+    let quarter = 9.0 * (64.0 * 128.0 + 4.0 * 128.0 * 128.0 + 128.0 * 256.0);
+    let fastdvdnet = Fastdvdnet::random(FastdvdnetSpec::GRAY, Ends::Circular, 0).unwrap();
+    assert_eq!(fastdvdnet.multiply_adds(), 2.0 * (full + half / 4.0 + quarter / 16.0));
+    // Three colors in and out and no noise map.
+    let ddnet = Ddnet::random(DdnetSpec::PAPER, Ends::Circular, 0).unwrap();
+    assert_eq!(ddnet.multiply_adds(), fastdvdnet.multiply_adds() + 2.0 * 9.0 * (90.0 + 2.0 * 32.0));
+}
+
+#[test]
 fn frames_of_any_size_pass_and_both_paths_agree() {
     for (h, w) in ODD_SIZES {
         for frames in [1, 2, 3, 5] {

@@ -10,7 +10,7 @@ use image::ImageError;
 use ndarray::{Array4, ArrayView3, ArrayView4, Axis, stack};
 use rayon::prelude::*;
 
-use crate::config::resolve::Output;
+use crate::config::Output;
 use crate::io::output::{WriteError, write_atomically};
 use crate::io::scene::Scene;
 use crate::io::{frames, video};

@@ -55,8 +55,8 @@ pub struct Record {
     /// Every other file of the run, relative to the record's folder. A later run may replace and remove these and no others.
     #[serde(default)]
     pub files: Vec<String>,
-    /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text` and
-    /// the `--set`s.
+    /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
+    /// what it `extends` and the `--set`s.
     pub config: serde_json::Value,
 }
 
@@ -88,6 +88,9 @@ pub struct MeasurementRecord {
     pub updates: usize,
     /// Calls of the denoiser.
     pub denoiser_calls: usize,
+    /// Multiply-adds of the networks' calls in units of 1e9, without those of online updates; `None` where no network ran.
+    #[serde(default)]
+    pub gmac: Option<f64>,
     /// Work that was left out.
     pub skipped: Skipped,
     /// How the denoiser adapted; only where it was to.
@@ -294,7 +297,7 @@ pub(crate) mod tests {
     pub(crate) const EXAMPLE: &str = r#"
 { "schema": 1, "experiment": "gray/gap-tv", "scene": "traffic48.mat", "solver": "gap", "denoiser": "tv",
   "measurements": [ { "index": 0, "psnr_db": 20.76, "ssim": 0.687, "ssim_gaussian": 0.70, "psnr_rgb_db": null, "seconds": 0.05, "iterations": 40,
-      "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },
+      "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "gmac": null, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },
       "trace": { "psnr_db": [], "relative_residual": [], "relative_change": [], "seconds": [] } } ],
   "mean": { "psnr_db": 20.76, "ssim": 0.687, "seconds": 0.05, "iterations": 40.0 },
   "peak_rss_bytes": 0, "threads": 2, "seed": 0, "version": "", "revision": "", "cpu": "",

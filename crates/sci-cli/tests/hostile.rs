@@ -7,11 +7,11 @@ use std::io::Cursor;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ndarray::{Array3, Array4};
-use sci_cli::config::check::check as check_experiment;
-use sci_cli::config::source::Source;
+use sci_cli::config;
 use sci_cli::io::mat::{self, Variable};
 use sci_cli::io::samples::Budget;
 use sci_cli::io::{frames, npy, video};
+use sci_cli::table::Source;
 
 /// The system's allocator, counting what is held, and the most that ever was.
 struct Counting;
@@ -155,10 +155,16 @@ fn damaged_files_are_harmless() {
         .unwrap();
     check(".jpg", &jpeg, |b| frames::decode(b).is_ok());
 
+    let demo = include_str!("../../../configs/demo.toml");
     let experiment = |b: &[u8]| {
         let text = String::from_utf8_lossy(b);
-        check_experiment(&Source::new("a.toml".as_ref(), &text, &[])).is_ok()
+        let source = Source::new("a.toml".as_ref(), &text, &[], &|_| Ok(demo.to_owned()));
+        source.and_then(|source| config::check(&source)).is_ok()
     };
-    check("experiment, gray", include_bytes!("../../../configs/demo.toml"), experiment);
+    check("experiment, gray", demo.as_bytes(), experiment);
     check("experiment, color", include_bytes!("../../../configs/color/default.toml"), experiment);
+    check("experiment that extends another", b"extends = 'b.toml'\n[denoiser]\nweight = 0.2\n", experiment);
+    let unfolding = b"[data]\npath = 'a'\n[solver]\nkind = 'gap'\naccelerate = false\n[denoiser]\nkind = 'unfolding'\n\
+                      weights = 'b'\n[[stage]]\niterations = 3\n";
+    check("experiment, unfolding", unfolding, experiment);
 }

@@ -359,6 +359,11 @@ impl Layers for UnfoldingNet {
         self.spec.channels
     }
 
+    /// Of one iteration.
+    fn multiply_adds(&self) -> f64 {
+        self.spec.multiply_adds() / self.spec.iterations as f64
+    }
+
     fn convs(&self) -> Vec<&Conv> {
         self.convs.iter().collect()
     }

@@ -25,8 +25,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 
-use crate::config::ConfigError;
 use crate::run_folder::Refusal;
+use crate::table::ConfigError;
 
 /// Reconstruct video from snapshot compressive measurements.
 #[derive(Debug, Parser)]

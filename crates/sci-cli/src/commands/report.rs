@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use ndarray::{Array4, ArrayView4, Axis};
+use serde::Deserialize;
 
 use super::{Done, UsageError};
-use crate::config::resolve::load_text;
+use crate::config::{Written, load_written};
 use crate::io::output::write_atomically;
 use crate::io::scene::{self, Keys, Reading, Scene};
 use crate::record::Record;
@@ -143,13 +144,11 @@ fn images<'a>(scene: Option<&'a Scene>, index: usize, recon: ArrayView4<'a, f32>
 /// The scene of a run, read again as its experiment says.
 fn scene_of(record: &Record) -> anyhow::Result<Scene> {
     let written = &record.config["written"];
-    let (file, text) = (written["file"].as_str(), written["text"].as_str());
-    let (file, text) = file.zip(text).context("the record does not hold the experiment's text")?;
-    let mut set: Vec<String> = serde_json::from_value(written["set"].clone())?;
+    let mut written = Written::deserialize(written).context("the record does not hold the experiment's text")?;
     // Where it was found then; the current folder may be another one now.
     let found = record.config["data"]["path"].as_str().context("the record names no data")?;
-    set.push(format!("data.path={}", toml::Value::from(found)));
-    let experiment = load_text(Path::new(file), text.to_owned(), &set)?;
+    written.set.push(format!("data.path={}", toml::Value::from(found)));
+    let experiment = load_written(&written)?;
     super::run::read_scene(&experiment)
 }
 

@@ -12,8 +12,7 @@ use sci_forward::{Noise, VideoShape};
 use serde_json::json;
 
 use super::{Done, UsageError, catch_interrupts};
-use crate::config::resolve::{Experiment, MaskSource, Simulate};
-use crate::config::{self};
+use crate::config::{self, Experiment, MaskSource, Simulate};
 use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
@@ -101,7 +100,7 @@ impl Args {
             "{} on {}: {} + {}, {count} measurement{plural} of {}",
             experiment.name,
             experiment.scene_name(),
-            experiment.solver_kind(),
+            experiment.solver.kind,
             experiment.denoiser_kinds(),
             scene.operator.shape()
         );

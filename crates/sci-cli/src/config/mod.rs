@@ -1,16 +1,359 @@
-//! Owns experiment files, in three steps and three types: [`mod@file`] (what the TOML says, key by key, strict),
-//! [`check`] (every value in range, every key with an effect), [`resolve`] (absolute paths, σ in `[0, 1]`).
+//! Owns an experiment: its tables put together, the rules between them, and what the record shows of it.
 //!
-//! Only the last type reaches the rest of the program, so no other code has to doubt a value. An error names the file
-//! and line (or the `--set` argument), the key, the value and what is legal.
+//! Denoisers are in [`parts`](crate::parts), solvers in [`solvers`](crate::solvers), the tables that are always there in a file each
+//! here. What is read is in range, complete and has an effect, so that no other code has to doubt a value; an error names the file and
+//! line (or the `--set` argument), the key, the value and what is legal.
 
-pub mod adaptation;
-pub mod check;
-pub mod denoising;
-pub mod file;
-pub mod resolve;
-pub mod skipping;
-pub mod source;
+mod data;
+mod online;
+mod output;
+mod skip;
+mod stage;
 
-pub use resolve::{Experiment, load};
-pub use source::ConfigError;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::parts::{Around, Chosen, Misfit, first_of_all};
+use crate::solvers::{self, Solver, Start};
+use crate::table::{Paths, Source, Table};
+
+pub use crate::table::ConfigError;
+pub use data::{Data, MaskSource, RandomMask, Simulate};
+pub use online::Online;
+pub use output::Output;
+pub use skip::Skip;
+pub use stage::Stage;
+
+/// An experiment ready to run.
+#[derive(Debug)]
+pub struct Experiment {
+    /// Name, a relative path such as `gray/gap-tv`.
+    pub name: String,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Where the measurements come from.
+    pub data: Data,
+    /// The solver.
+    pub solver: Solver,
+    /// All denoisers.
+    pub denoisers: Vec<Chosen>,
+    /// The stages.
+    pub stages: Vec<Stage>,
+    /// Stop once the relative change is at most this; 0 never.
+    pub relative_change: f64,
+    /// Stop a measurement after so many seconds.
+    pub seconds: Option<f64>,
+    /// What is left out, if anything may be.
+    pub skip: Option<Skip>,
+    /// How networks adapt while they solve, if they do.
+    pub online: Option<Online>,
+    /// What to write.
+    pub output: Output,
+    /// The keys of its tables, defaults filled in.
+    json: Value,
+    /// What it was read from.
+    written: Written,
+}
+
+/// An experiment as it was written, so that a record can be run again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Written {
+    /// Its file.
+    #[serde(flatten)]
+    pub file: WrittenFile,
+    /// The files that it extends, nearest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub extends: Vec<WrittenFile>,
+    /// The `--set` arguments.
+    pub set: Vec<String>,
+}
+
+/// A file as it was when it was read.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WrittenFile {
+    /// Where it was, absolute.
+    pub file: String,
+    /// Its text.
+    pub text: String,
+}
+
+/// Reads an experiment file with `--set` arguments applied.
+///
+/// # Errors
+/// [`ConfigError`] naming the place, the key, the value and what is legal.
+pub fn load(path: &Path, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    from_source(&Source::read(path, "experiment", arguments)?, arguments)
+}
+
+/// Reads an experiment from a record; its files need not be there any more.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_written(written: &Written) -> Result<Experiment, ConfigError> {
+    let held = |path: &Path| written.extends.iter().find(|base| Path::new(&base.file) == path);
+    let read = |path: &Path| held(path).map(|base| base.text.clone()).ok_or("the record does not hold it".to_owned());
+    let source = Source::new(written.file.file.as_ref(), &written.file.text, &written.set, &read)?;
+    from_source(&source, &written.set)
+}
+
+/// Checks everything but whether files are where they are said to be.
+///
+/// # Errors
+/// The first mistake.
+pub fn check(source: &Source) -> Result<Experiment, ConfigError> {
+    read(source, Paths::AsWritten, &[])
+}
+
+/// A file that is missing is told only of an experiment that is right otherwise.
+fn from_source(source: &Source, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    check(source)?;
+    read(source, Paths::LookedUp, arguments)
+}
+
+/// The tables of an experiment before they are read.
+struct Tables<'s> {
+    name: Option<String>,
+    seed: u64,
+    data: Option<Table<'s>>,
+    solver: Option<Table<'s>>,
+    schedule: stage::Tables<'s>,
+    stop: Table<'s>,
+    skip: Option<Table<'s>>,
+    online: Option<Table<'s>>,
+    /// Whether `output` is the word `minimal`, and the table if it is none.
+    output: (bool, Table<'s>),
+}
+
+impl<'s> Tables<'s> {
+    fn take(t: &mut Table<'s>) -> Result<Self, ConfigError> {
+        let legal = "letters, digits, '.', '_' and '-', in parts joined by '/'";
+        let part_ok = |p: &str| {
+            !p.is_empty() && !p.starts_with('.') && p.chars().all(|c| c.is_ascii_alphanumeric() || "._-".contains(c))
+        };
+        Ok(Self {
+            name: t.text("name", legal, |n| n.split('/').all(part_ok)),
+            seed: t.seed("seed", 0),
+            data: t.table("data")?,
+            solver: t.table("solver")?,
+            schedule: stage::Tables::take(t)?,
+            stop: t.table_or_empty("stop")?,
+            skip: t.table("skip")?,
+            online: t.table("online")?,
+            output: (t.word("output", "minimal"), t.table_or_empty("output")?),
+        })
+    }
+}
+
+fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    let (tables, _) = Table::root(source, paths)?.read(Tables::take)?;
+    let missing = |key: &str| source.file_error(format!("no [{key}] table"));
+    let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
+    let (name, seed) = (tables.name.unwrap_or_else(stem), tables.seed);
+    let (data, data_json) = tables.data.ok_or_else(|| missing("data"))?.read(|t| Data::read(t, seed))?;
+    let solver = solvers::read(tables.solver.ok_or_else(|| missing("solver"))?)?;
+    let (mut skip, mut skip_json) = unless_off(tables.skip, |t| Skip::read(t, seed))?;
+    let (denoisers, stages) = tables.schedule.read(source, skip.is_some())?;
+    if let Some(skip) = &mut skip {
+        skip.keep_trained_sigmas(&denoisers);
+        skip_json["overshoot"] = skip.hold_out.overshoot.into();
+    }
+    let (online, online_json) = unless_off(tables.online, |t| Online::read(t, seed, &denoisers))?;
+    let ((relative_change, seconds), stop_json) = tables
+        .stop
+        .read(|t| Ok((t.number("relative_change", 0.0, 0.0..=1.0), t.optional_number("seconds", 1e-3..=1e6))))?;
+    let (minimal, output) = tables.output;
+    let (output, output_json) = output.read(|t| Ok(Output::read(t, minimal)))?;
+    let json = json!({
+        "name": name, "seed": seed, "data": data_json, "stop": stop_json, "skip": skip_json, "online": online_json,
+        "output": output_json,
+    });
+    let written = Written::of(source, arguments);
+    let mut experiment = Experiment {
+        name,
+        seed,
+        data,
+        solver,
+        denoisers,
+        stages,
+        relative_change,
+        seconds,
+        skip,
+        online,
+        output,
+        json,
+        written,
+    };
+    experiment
+        .check_denoisers()
+        .map_err(|Misfit { key, problem }| source.error_at(key, format!("`{key}` {problem}")))?;
+    experiment.begin_with_tv();
+    Ok(experiment)
+}
+
+/// Reads a table that need not be there and can be switched off.
+fn unless_off<T>(
+    table: Option<Table<'_>>,
+    read: impl FnOnce(&mut Table<'_>) -> Option<T>,
+) -> Result<(Option<T>, Value), ConfigError> {
+    match table.map(|t| t.read(|t| Ok(read(t)))).transpose()? {
+        Some((Some(value), json)) => Ok((Some(value), json)),
+        _ => Ok((None, json!({ "enabled": false }))),
+    }
+}
+
+impl Written {
+    fn of(source: &Source, arguments: &[String]) -> Self {
+        let file = |(path, text): (&Path, &str)| {
+            let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+            WrittenFile { file: absolute.to_string_lossy().into_owned(), text: text.to_owned() }
+        };
+        let mut files = source.files().map(file);
+        Self {
+            file: files.next().expect("a source begins with a file"),
+            extends: files.collect(),
+            set: arguments.to_vec(),
+        }
+    }
+}
+
+impl Experiment {
+    /// Asks each denoiser about the rest.
+    fn check_denoisers(&self) -> Result<(), Misfit> {
+        self.denoisers.iter().enumerate().try_for_each(|(i, denoiser)| {
+            let stages: Vec<bool> = self.stages.iter().map(|stage| stage.denoiser == i).collect();
+            denoiser.part.check(&Around {
+                solver: self.solver.kind,
+                accelerated: self.solver.method.accelerated(),
+                from_mean: self.solver.start == Start::Mean,
+                stages: &stages,
+                online: self.online.is_some(),
+                tiles: self.skip.is_some_and(|s| s.tiles),
+            })
+        })
+    }
+
+    /// Where `[skip]` may, lets TV go first where a network would that is told a σ: as a stage of its own from the mean, for as
+    /// long as it pays, so that the network begins where TV ends.
+    fn begin_with_tv(&mut self) {
+        let first = self.stages.first().map(|stage| &self.denoisers[stage.denoiser].part);
+        let waits = first.is_some_and(|part| part.network().is_some() && part.instead_of_sigma().is_none());
+        if waits && self.skip.is_some_and(|s| s.cheap_first) && self.solver.begin_with_tv() {
+            self.stages.insert(0, Stage { sigma: None, iterations: 16, denoiser: self.denoisers.len() });
+            self.denoisers.push(first_of_all());
+        }
+    }
+
+    /// The file or folder name of the data, as the run record's `scene`.
+    pub fn scene_name(&self) -> String {
+        let path = &self.data.path;
+        path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+    }
+
+    /// The denoisers' kinds in the order of the stages, repeated ones once, joined by ` → `.
+    pub fn denoiser_kinds(&self) -> String {
+        let mut kinds: Vec<&str> = self.stages.iter().map(|s| self.denoisers[s.denoiser].kind).collect();
+        kinds.dedup();
+        kinds.join(" → ")
+    }
+
+    /// Every file and folder it reads, with its key.
+    pub fn inputs(&self) -> Vec<(&'static str, &Path)> {
+        let demosaicer = self.solver.demosaicer.as_ref().and_then(|d| d.weights());
+        let networks =
+            self.denoisers.iter().filter_map(|d| Some(("denoiser.weights", d.part.network()?.weights.as_path())));
+        let all = [("data.path", self.data.path.as_path())]
+            .into_iter()
+            .chain(self.data.mask_file().map(|path| ("data.mask.path", path)))
+            .chain(demosaicer.map(|path| ("solver.weights", path)))
+            .chain(networks);
+        all.filter(|(_, path)| !path.to_string_lossy().starts_with("bundled:")).collect()
+    }
+
+    /// [`Experiment::to_json`] and what it was read from, so that it can be run again.
+    pub fn record_json(&self) -> Value {
+        let mut value = self.to_json();
+        value["written"] = json!(self.written);
+        value
+    }
+
+    /// The resolved experiment for the run record, with the keys of the TOML; σ in `[0, 1]`, paths absolute.
+    pub fn to_json(&self) -> Value {
+        let stage = |s: &Stage| json!({ "sigma": s.sigma, "iterations": s.iterations, "denoiser": s.denoiser });
+        let mut value = self.json.clone();
+        value["solver"] = self.solver.json.clone();
+        value["denoisers"] = self.denoisers.iter().map(|d| d.json.clone()).collect();
+        value["stage"] = self.stages.iter().map(stage).collect();
+        value
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    fn configs() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs")
+    }
+
+    #[test]
+    fn every_shipped_experiment_is_right() {
+        let mut checked = 0;
+        for folder in ["gray", "color", "bench", "."] {
+            for entry in std::fs::read_dir(configs().join(folder)).unwrap() {
+                let path = entry.unwrap().path();
+                if path.extension().is_some_and(|e| e == "toml") && !path.ends_with("expected.toml") {
+                    let experiment = check(&Source::read(&path, "experiment", &[]).unwrap()).unwrap();
+                    // What the record shows is what the file says, under the same keys.
+                    let shown = experiment.to_json();
+                    assert_eq!(shown["solver"]["kind"], experiment.solver.kind, "{}", path.display());
+                    assert_eq!(shown["denoisers"][0]["kind"], experiment.denoisers[0].kind, "{}", path.display());
+                    checked += 1;
+                }
+            }
+        }
+        assert!(checked > 20, "{checked}");
+    }
+
+    #[test]
+    fn the_record_shows_every_key_with_its_default() {
+        let text = "[data]\npath = 'a'\n[solver]\nkind = 'two-stage'\n[denoiser]\nkind = 'fastdvdnet'\nweights = 'b'\n\
+                    [[stage]]\nsigma = 51\niterations = 3\n[online]\n[skip]\n";
+        let source = Source::new("x/a.toml".as_ref(), text, &[], &|_| Err("no other files".into())).unwrap();
+        let shown = check(&source).unwrap().to_json();
+        let solver = json!({
+            "kind": "two-stage", "start": "tv", "start_iterations": 40, "start_weight": 0.1, "rho": 1.0, "tau": 100.0,
+            "convention": "paper-code", "demosaicer": null,
+        });
+        assert_eq!((&shown["name"], &shown["solver"]), (&json!("a"), &solver));
+        let denoiser =
+            json!({ "kind": "fastdvdnet", "weights": "b", "precision": "f32", "flips": false, "ends": "circular" });
+        assert_eq!(shown["denoisers"], json!([denoiser]));
+        assert_eq!(shown["stage"], json!([{ "sigma": 0.2f32, "iterations": 3, "denoiser": 0 }]));
+        let interval = ::online::AdaptConfig::default().schedule.interval;
+        assert_eq!((&shown["online"]["interval"], &shown["skip"]["spacing"]), (&json!(interval), &json!(12)));
+    }
+
+    #[test]
+    fn a_list_of_sigmas_is_that_many_stages() {
+        let configs = configs();
+        let stages = |more: &str| {
+            let path = format!("data.path={}", configs.join("demo/bunny").display());
+            let experiment = load(&configs.join("gray/refined.toml"), &[path, more.into()]).unwrap();
+            experiment
+                .stages
+                .iter()
+                .map(|s| (s.sigma.map(|sigma| sigma * 255.0), s.iterations, s.denoiser))
+                .collect::<Vec<_>>()
+        };
+        let refined = stages("seed=0");
+        assert_eq!(refined.len(), 14);
+        assert_eq!(refined[..2], [(Some(20.0), 1, 0), (Some(18.0), 1, 0)]);
+        assert_eq!(refined[12..], [(Some(12.0), 6, 1), (Some(8.0), 6, 1)]);
+        let written_out = "stage=[{sigma=9.5,iterations=3},{sigma=4,iterations=3}]";
+        assert_eq!(stages("stage=[{sigma=[9.5, 4],iterations=3}]"), stages(written_out));
+    }
+}

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use super::super::{Done, interrupted};
 use super::result_shape;
-use crate::config::resolve::Experiment;
+use crate::config::Experiment;
 use crate::factory::Factory;
 use crate::io::output::{WriteError, write_atomically};
 use crate::io::recon::{Parts, VideoFormat, join, link_or_copy};
@@ -138,7 +138,7 @@ impl Results<'_> {
             schema: SCHEMA,
             experiment: self.experiment.name.clone(),
             scene: self.experiment.scene_name(),
-            solver: self.experiment.solver_kind().to_owned(),
+            solver: self.experiment.solver.kind.to_owned(),
             denoiser: self.experiment.denoiser_kinds(),
             mean: MeanRecord::of(&measurements),
             measurements,

@@ -8,7 +8,7 @@ use ndarray::{Array3, ArrayView3, ArrayView4};
 use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
 
 use super::super::interrupted;
-use crate::config::resolve::Experiment;
+use crate::config::Experiment;
 use crate::factory::{Factory, Solved};
 use crate::io::scene::Scene;
 use crate::pictures::Job;
@@ -100,6 +100,7 @@ fn measurement_record(
         relative_residual: Some(outcome.relative_residual),
         updates: counts.kept,
         denoiser_calls: outcome.iterations,
+        gmac: work.gmac,
         skipped: Skipped {
             iterations: whole - planned + left,
             tiles: work.skipped_tiles,
@@ -151,17 +152,7 @@ fn line(m: &MeasurementRecord) -> String {
 }
 
 fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
-    use crate::config::check::{Momentum, Solver, Start};
-    let suggestion = match (experiment.start, experiment.solver) {
-        // It has already gone on without acceleration.
-        (_, Solver::Gap { .. }) if m.backed_off.is_some() => "raise stage.0.sigma, or use another denoiser",
-        (Start::Adjoint, _) => "start from solver.start = \"mean\" (the adjoint is not normalised)",
-        (_, Solver::Gap { momentum: Some(Momentum::Zero) }) => "set solver.momentum = \"measurement\"",
-        (_, Solver::Gap { momentum: Some(_) }) => "set solver.accelerate = false",
-        (_, Solver::Gap { momentum: None }) => "raise stage.0.sigma, or use another denoiser",
-        (_, Solver::TwoStage { .. }) => "raise solver.rho, or use solver.kind = \"gap\"",
-        (_, Solver::Admm { .. }) => "raise solver.gamma, or use solver.kind = \"gap\"",
-    };
+    let suggestion = experiment.solver.advice(m.backed_off.is_some());
     format!("measurement {} diverged in iteration {}: {suggestion}", m.index, m.iterations.saturating_sub(1))
 }
 

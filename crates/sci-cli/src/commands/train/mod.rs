@@ -14,9 +14,7 @@ use nets::train::{TrainConfig, Trainer};
 use nets::weights::Storage;
 
 use super::{Done, UsageError, catch_interrupts, interrupted};
-use crate::config::ConfigError;
-use crate::config::file::Section;
-use crate::config::source::{Place, Source};
+use crate::table::{ConfigError, Paths, Source, Table};
 use log::Log;
 
 /// Time between progress lines where there is no terminal.
@@ -73,36 +71,13 @@ impl Args {
 
 /// Reads and checks a training file.
 fn load(path: &Path, arguments: &[String]) -> Result<TrainConfig, ConfigError> {
-    let problem = |problem: String| ConfigError { place: Place::File(path.to_owned()), problem };
-    let text = std::fs::read_to_string(path).map_err(|e| problem(format!("cannot read the training file: {e}")))?;
-    let source = Source::new(path, &text, arguments);
-    let config: TrainConfig = Section::root(&source)?.read(&[]).map_err(|mut error| {
-        // The whole file is one section, which has no key to name; the place says enough.
-        error.problem = error.problem.trim_start_matches("``: ").to_owned();
-        error
-    })?;
-    config.validate().map_err(|error| locate(&source, &error))?;
-    Ok(config)
-}
-
-/// Says where in the file the setting is that an error names.
-fn locate(source: &Source, error: &nets::Error) -> ConfigError {
-    let found = |key: &str| {
-        let mut steps = key.split('.');
-        let tree = source.tree().ok()?;
-        let mut value = tree.get(steps.next()?)?;
-        for step in steps {
-            value = value.get_ref().get(step)?;
-        }
-        Some(value.span())
-    };
-    match error {
-        nets::Error::Setting { key, .. } => match found(key) {
-            Some(span) => source.error(&span, error.to_string()),
-            None => source.file_error(error.to_string()),
-        },
+    let source = Source::read(path, "training", arguments)?;
+    let config: TrainConfig = Table::root(&source, Paths::AsWritten)?.deserialize()?;
+    config.validate().map_err(|error| match &error {
+        nets::Error::Setting { key, .. } => source.error_at(key, error.to_string()),
         other => source.file_error(other.to_string()),
-    }
+    })?;
+    Ok(config)
 }
 
 /// A run with its files.

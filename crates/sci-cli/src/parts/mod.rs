@@ -1,0 +1,199 @@
+//! Owns the denoisers of an experiment: a file for each, with its keys and what is built of it, and the one list of them.
+
+mod demosaicer;
+mod fastdvdnet;
+mod ffdnet;
+mod network;
+mod saving;
+mod tv;
+mod unfolding;
+mod wnnm;
+
+use std::fmt::Debug;
+use std::path::Path;
+
+use admm::{Demosaicked, Denoiser, Prior};
+use online::{AdaptConfig, Task, Update};
+use sci_forward::CfaPattern;
+use serde_json::Value;
+
+use crate::table::{ConfigError, Table};
+
+pub use demosaicer::{Demosaicer, Sensor};
+pub use network::{Inference, PRECISIONS};
+pub use saving::{MultiplyAdds, Saving, Work};
+pub use tv::first_of_all;
+
+/// Every denoiser.
+const DENOISERS: &[Entry] = &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, unfolding::ENTRY];
+/// Those that are going to be.
+const NOT_YET: &[&str] = &["wavelet"];
+
+/// A line of [`DENOISERS`].
+struct Entry {
+    /// The `kind` that names it.
+    kind: &'static str,
+    /// Asks a table for its keys.
+    read: fn(&mut Table<'_>) -> Box<dyn Part>,
+}
+
+/// A denoiser of an experiment.
+#[derive(Debug)]
+pub struct Chosen {
+    /// The `kind` that names it.
+    pub kind: &'static str,
+    /// Its keys for the record.
+    pub json: Value,
+    /// What it is.
+    pub part: Box<dyn Part>,
+}
+
+/// Reads a `[denoiser]`, or that of a stage.
+///
+/// # Errors
+/// The first mistake.
+pub fn read(table: Table<'_>) -> Result<Chosen, ConfigError> {
+    let available: Vec<&str> = DENOISERS.iter().map(|entry| entry.kind).collect();
+    let legal = [&available, NOT_YET].concat();
+    let ((kind, part), json) = table.read(|t| {
+        let kind = t.kind(&legal, None)?;
+        let entry = DENOISERS.iter().find(|entry| entry.kind == kind).ok_or_else(|| t.not_yet(&available))?;
+        Ok((entry.kind, (entry.read)(t)))
+    })?;
+    Ok(Chosen { kind, json, part })
+}
+
+/// What a denoiser says of itself, and how it is built.
+pub trait Part: Debug + Send + Sync {
+    /// What it has in place of a σ, said after "its denoiser is"; nothing if its stages must give one.
+    fn instead_of_sigma(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// How its network is run, if it is one.
+    fn network(&self) -> Option<&Inference> {
+        None
+    }
+
+    /// Whether it can learn while it solves.
+    fn adapts(&self) -> bool {
+        false
+    }
+
+    /// What the rest of an experiment must not be, if it is used there.
+    ///
+    /// # Errors
+    /// What does not fit it.
+    fn check(&self, _around: &Around<'_>) -> Result<(), Misfit> {
+        Ok(())
+    }
+
+    /// What all measurements share of it, such as a loaded network.
+    ///
+    /// # Errors
+    /// When a file cannot be read, or is not for such a sensor.
+    fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>>;
+}
+
+/// The experiment around a denoiser.
+#[derive(Clone, Copy, Debug)]
+pub struct Around<'e> {
+    /// The solver's `kind`.
+    pub solver: &'e str,
+    /// Whether it is accelerated.
+    pub accelerated: bool,
+    /// Whether it starts from the mean.
+    pub from_mean: bool,
+    /// For each stage whether it is one of this denoiser.
+    pub stages: &'e [bool],
+    /// Whether networks adapt.
+    pub online: bool,
+    /// Whether tiles may be left out.
+    pub tiles: bool,
+}
+
+/// What does not fit a denoiser.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Misfit {
+    /// The key to change.
+    pub key: &'static str,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+/// Where a part is to work.
+#[derive(Clone, Copy, Debug)]
+pub struct Site<'f> {
+    /// The pattern of a color sensor, `None` for a gray one.
+    pub cfa: Option<CfaPattern>,
+    /// How networks learn.
+    pub adapt: AdaptConfig,
+    /// What counts their work.
+    pub work: &'f MultiplyAdds,
+}
+
+impl Site<'_> {
+    /// Checks that weights are for the sensor's colors.
+    ///
+    /// # Errors
+    /// If they are for others.
+    pub fn fits(&self, channels: usize, weights: &Path) -> anyhow::Result<()> {
+        let (scene, needed) = if self.cfa.is_some() { ("color", 3) } else { ("gray", 1) };
+        let mosaic = if channels == 3 { "; name its Bayer pattern in data.cfa if it is a mosaic" } else { "" };
+        anyhow::ensure!(
+            channels == needed,
+            "denoiser.weights: {}: a network for {channels} channels, but the scene is {scene}: it needs one for {needed}{mosaic}",
+            weights.display()
+        );
+        Ok(())
+    }
+}
+
+/// A part as far as it can be shared by all measurements.
+pub trait Built: Send {
+    /// On gray or RGB video as it is; nothing if it does not work on frames alone.
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>>;
+
+    /// On what the sensor sees.
+    fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p>;
+
+    /// As what learns, if it does.
+    fn learning(&mut self) -> Option<&mut dyn Learning> {
+        None
+    }
+}
+
+/// A denoiser of frames as a prior on what the sensor sees.
+fn demosaicked<'p>(denoiser: Box<dyn Denoiser + 'p>, color: Option<&Sensor>) -> Box<dyn Prior + 'p> {
+    match color {
+        Some(sensor) => Box::new(Demosaicked::new(denoiser, sensor.demosaicer.clone(), sensor.cfa)),
+        None => Box::new(denoiser),
+    }
+}
+
+/// A network that learns while it solves, or could.
+pub trait Learning {
+    /// Turns to a measurement.
+    ///
+    /// # Errors
+    /// As [`Task::prepare`].
+    fn prepare(&mut self, task: &Task) -> online::Result<()>;
+
+    /// Writes its weights as they are now.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    fn save(&mut self, path: &Path) -> online::Result<()>;
+
+    /// Takes weights that were saved.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    fn load(&mut self, path: &Path) -> online::Result<()>;
+
+    /// Counts updates that were made before the program was stopped.
+    fn take_up(&mut self, updates: &[Update]);
+
+    /// Every update so far.
+    fn updates(&self) -> &[Update];
+}
