@@ -151,7 +151,7 @@ fn what_an_unfolding_network_was_not_trained_for_is_refused() {
         ("solver={kind=\"gap\"}", ["`solver.accelerate` is true", "plain GAP", "legal: false"]),
         ("solver={kind=\"admm\"}", ["`solver.kind` is \"admm\"", "plain GAP", "legal: gap"]),
         ("solver={kind=\"two-stage\"}", ["`solver.kind` is \"two-stage\"", "plain GAP", "legal: gap"]),
-        ("solver.start=tv", ["--set solver.start=tv:", "`solver.start` is not the mean", "legal: mean"]),
+        ("solver.start=adjoint", ["--set solver.start=adjoint:", "is neither the mean nor TV", "legal: mean, tv"]),
         ("stage.0.sigma=10", ["--set stage.0.sigma=10:", "`stage.0.sigma` has no effect", "finds the noise by itself"]),
         ("online.enabled=true", ["`online.enabled` is true", "does not adapt", "legal: false"]),
         ("skip.enabled=true", ["`skip.tiles` is true", "the measurement as a whole", "legal: false"]),

@@ -45,7 +45,8 @@ impl Progress {
 /// with a mirror z (ADMM) `p = 2 from − z`. `damping = 0` with `p = from` projects onto `{x : H x = t}`; `damping = γ > 0` solves
 /// `argmin_x ‖y − H x‖² + γ‖x − from‖²` (paper, Eq. `qv_k+1`). With the variance n of the measurement's noise
 /// ([`Measurement::variance`]) and `from` known to a variance of s², `precision = 1/s²` gives the likeliest x,
-/// `argmin_x Σ (y − H x)²/n + ‖x − from‖²/s²`. Pixels with `diag(H Hᵀ) = 0` stay as they are.
+/// `argmin_x Σ (y − H x)²/n + ‖x − from‖²/s²`. A clipped pixel ([`Measurement::with_clip`]) is left alone by a video that gives it as
+/// much light as it measures, or more. Pixels with `diag(H Hᵀ) = 0` stay as they are.
 ///
 /// ```
 /// use std::sync::Arc;
@@ -129,6 +130,7 @@ impl DataStep<'_> {
                         target: Target {
                             gram: packed(gram.row(row)),
                             y: packed(y.row(row)),
+                            measurement,
                             variance: variance.map(|variance| packed(variance.index_axis_move(Axis(0), row))),
                             damping,
                             precision,
@@ -152,17 +154,26 @@ impl DataStep<'_> {
         mut to: ArrayViewMut3<'_, f32>,
     ) -> Progress {
         let Self { damping, precision, momentum, hold_momentum, mirror, previous } = self;
-        let (operator, y) = (measurement.operator(), measurement.y());
+        let operator = measurement.operator();
         let progress = progress(measurement, from, previous.unwrap_or(from));
         let mut h = operator.forward(from);
-        let point = mirror.map(|z| &h * 2.0 - operator.forward(z));
-        match (momentum, point) {
-            (Some(y1), _) => Zip::from(&mut h).and(y).and(y1).for_each(|h, &y, y1| {
-                *y1 += if hold_momentum { 0.0 } else { y - *h };
-                *h = *y1 - *h;
+        let point = match mirror {
+            Some(z) => &h * 2.0 - operator.forward(z),
+            None => h.clone(),
+        };
+        let level = measurement.clip();
+        let of_all = Zip::from(&mut h).and(measurement.y()).and(&point);
+        match momentum {
+            Some(y1) => of_all.and(y1).for_each(|h, &y, &point, y1| {
+                *h = match level {
+                    Some(_) => difference(point, y, Some(y1), hold_momentum, level),
+                    None => {
+                        *y1 += if hold_momentum { 0.0 } else { y - point };
+                        *y1 - point
+                    }
+                };
             }),
-            (None, Some(point)) => Zip::from(&mut h).and(y).and(&point).for_each(|h, &y, &point| *h = y - point),
-            (None, None) => h.zip_mut_with(&y, |h, &y| *h = y - *h),
+            None => of_all.for_each(|h, &y, &point| *h = difference(point, y, None, hold_momentum, level)),
         }
         let mut divisor = operator.gram().mapv(|gram| if gram > 0.0 { gram + damping } else { f32::INFINITY });
         if let Some(variance) = measurement.variance() {
@@ -217,7 +228,11 @@ pub fn progress(measurement: &Measurement, x: ArrayView3<'_, f32>, previous: Arr
                 if let Some(whole) = &whole {
                     hx.iter_mut().zip(whole.row(row)).for_each(|(hx, &whole)| *hx = whole);
                 }
-                sum = sum.plus(norms.progress(squared_residual(&hx, &packed(y.row(row)), &packed(gram.row(row)))));
+                let mut y = packed(y.row(row));
+                if measurement.clip().is_some() {
+                    measurement.one_sided(y.to_mut(), &hx);
+                }
+                sum = sum.plus(norms.progress(squared_residual(&hx, &y, &packed(gram.row(row)))));
             }
             sum
         })
@@ -234,6 +249,7 @@ fn rows_at(video: ArrayView3<'_, f32>, row: usize) -> ArrayView2<'_, f32> {
 struct Target<'a> {
     gram: Cow<'a, [f32]>,
     y: Cow<'a, [f32]>,
+    measurement: &'a Measurement,
     variance: Option<Cow<'a, [f32]>>,
     damping: f32,
     precision: f32,
@@ -263,13 +279,15 @@ struct Chunk {
     hz: Option<Vec<f32>>,
     /// What the difference to the target is divided by.
     divisor: Vec<f32>,
+    /// y, one-sided where it is clipped.
+    y: Vec<f32>,
 }
 
 impl Chunk {
     fn new(frames: usize, mirrored: bool) -> Self {
         let (video, masks) = (vec![0.0; frames * CHUNK], vec![0.0; frames * CHUNK]);
         let row = || vec![0.0; CHUNK];
-        Self { video, masks, hx: row(), hz: mirrored.then(row), divisor: row() }
+        Self { video, masks, hx: row(), hz: mirrored.then(row), divisor: row(), y: row() }
     }
 }
 
@@ -283,16 +301,20 @@ impl Row<'_> {
             let columns = start..(start + CHUNK).min(width);
             let count = columns.len();
             self.read(start, count, chunk, &mut norms);
-            let Target { gram, y, hold_momentum, .. } = &self.target;
+            let Target { gram, y, measurement, hold_momentum, .. } = &self.target;
             let (gram, y) = (&gram[columns.clone()], &y[columns.clone()]);
             let (hx, divisor) = (&mut chunk.hx[..count], &mut chunk.divisor[..count]);
-            residual += squared_residual(hx, y, gram);
             self.target.divisor(columns.clone(), divisor);
-            match (&mut y1, &chunk.hz) {
-                (Some(y1), _) if *hold_momentum => coefficients(hx, &y1[columns.clone()], divisor),
-                (Some(y1), _) => accelerated_coefficients(hx, y, divisor, &mut y1[columns.clone()]),
-                (None, Some(hz)) => mirrored_coefficients(hx, &hz[..count], y, divisor),
-                (None, None) => coefficients(hx, y, divisor),
+            if let Some(level) = measurement.clip() {
+                chunk.y[..count].copy_from_slice(y);
+                measurement.one_sided(&mut chunk.y[..count], hx);
+                residual += squared_residual(hx, &chunk.y[..count], gram);
+                let y1 = y1.as_deref_mut().map(|y1| &mut y1[columns.clone()]);
+                let hz = chunk.hz.as_ref().map(|hz| &hz[..count]);
+                one_sided_coefficients(hx, hz, y, y1, *hold_momentum, level, divisor);
+            } else {
+                residual += squared_residual(hx, y, gram);
+                self.whole_coefficients(columns.clone(), hx, chunk.hz.as_deref(), y1.as_deref_mut(), divisor);
             }
             for (t, mut to) in to.outer_iter_mut().enumerate() {
                 let (video, masks) = (&chunk.video[t * count..][..count], &chunk.masks[t * count..][..count]);
@@ -306,6 +328,24 @@ impl Row<'_> {
             }
         }
         norms.progress(residual)
+    }
+
+    /// What the masks are multiplied with, of a sensor that does not clip, in the place of `H from`.
+    fn whole_coefficients(
+        &self,
+        columns: Range<usize>,
+        hx: &mut [f32],
+        hz: Option<&[f32]>,
+        y1: Option<&mut [f32]>,
+        divisor: &[f32],
+    ) {
+        let y = &self.target.y[columns.clone()];
+        match (y1, hz) {
+            (Some(y1), _) if self.target.hold_momentum => coefficients(hx, &y1[columns], divisor),
+            (Some(y1), _) => accelerated_coefficients(hx, y, divisor, &mut y1[columns]),
+            (None, Some(hz)) => mirrored_coefficients(hx, &hz[..y.len()], y, divisor),
+            (None, None) => coefficients(hx, y, divisor),
+        }
     }
 
     /// Copies `count` columns of all frames and masks, and sums them up.
@@ -367,6 +407,34 @@ fn noisy_divisor(gram: &[f32], damping: f32, variance: &[f32], precision: f32, t
     for ((to, gram), variance) in to.iter_mut().zip(gram).zip(variance) {
         *to = if *gram > 0.0 { gram + damping + precision * variance } else { f32::INFINITY };
     }
+}
+
+/// [`difference`] over the divisor, of a sensor that clips at `level`.
+fn one_sided_coefficients(
+    hx: &mut [f32],
+    hz: Option<&[f32]>,
+    y: &[f32],
+    mut y1: Option<&mut [f32]>,
+    hold_momentum: bool,
+    level: f32,
+    divisor: &[f32],
+) {
+    for i in 0..hx.len() {
+        let point = hz.map_or(hx[i], |hz| 2.0 * hx[i] - hz[i]);
+        let y1 = y1.as_deref_mut().map(|y1| &mut y1[i]);
+        hx[i] = difference(point, y[i], y1, hold_momentum, Some(level)) / divisor[i];
+    }
+}
+
+/// `t − H p` of a pixel; what a clipped pixel asks for, and what it has asked for in y1 beyond y, is never negative: a constraint `H x ≥ y`
+/// and its multiplier.
+fn difference(point: f32, y: f32, y1: Option<&mut f32>, hold_momentum: bool, level: Option<f32>) -> f32 {
+    let one_sided = |v: f32| if level.is_some_and(|level| y >= level) { v.max(0.0) } else { v };
+    let Some(y1) = y1 else { return one_sided(y - point) };
+    if !hold_momentum {
+        *y1 = y + one_sided(*y1 + (y - point) - y);
+    }
+    one_sided(*y1 - point)
 }
 
 /// Turns `H x` of a chunk into `(y − H x) / divisor`.

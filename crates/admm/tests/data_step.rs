@@ -74,13 +74,14 @@ proptest! {
     #[test]
     fn the_fused_step_equals_the_definition(
         shape in shapes(), seed in any::<u64>(), damping in prop_oneof![Just(0f32), 0.01f32..2.0], hole in any::<bool>(),
-        (noisy, precision, hold_momentum) in (any::<bool>(), 0f32..100.0, any::<bool>())
+        (noisy, precision, hold_momentum) in (any::<bool>(), 0f32..100.0, any::<bool>()),
+        clip in prop_oneof![Just(None), (0.5f32..2.0).prop_map(Some)]
     ) {
         let noise = noisy.then(|| Noise::new(Some(50.0), 0.1).unwrap());
         for masks in mask_families(shape, seed) {
             let (x, y) = (uniform(shape.dim(), seed), gaussian(shape.image_dim(), seed + 1));
             let (previous, z) = (uniform(shape.dim(), seed + 2), uniform(shape.dim(), seed + 3));
-            let ways = both_ways(masks, &y, hole).map(|measurement| measurement.with_noise(noise));
+            let ways = both_ways(masks, &y, hole).map(|measurement| measurement.with_noise(noise).with_clip(clip));
             for kind in 0..3 {
                 let step = |measurement: &Measurement| {
                     let (mut to, mut y1) = (x.mapv(|_| f32::NAN), y.mapv(|v| v * 0.5));

@@ -429,3 +429,27 @@ fn noise_that_is_known_is_not_reconstructed() {
     let silent = clean.clone().with_noise(Some(sci_forward::Noise::new(None, 0.0).unwrap()));
     assert_eq!(solve(&clean), solve(&silent));
 }
+
+/// A sensor that clips a tenth of its pixels: one-sided they tell more than left out, and far more than believed.
+#[test]
+fn clipped_pixels_say_that_there_was_as_much_light_or_more() {
+    let shape = VideoShape { frames: 6, height: 48, width: 48 };
+    let truth = moving_square(shape);
+    let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap()));
+    let mut y = operator.forward(truth.view());
+    let mut sorted: Vec<f32> = y.iter().copied().collect();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let level = sorted[sorted.len() * 9 / 10];
+    y.mapv_inplace(|y| y.min(level));
+    let believed = Measurement::new(operator, y.clone()).unwrap();
+    let left_out = believed.restricted(y.mapv(|y| y < level).view()).unwrap();
+    let one_sided = believed.clone().with_clip(Some(level));
+    let error = |measurement: &Measurement| {
+        let plan = Plan::new([Stage { sigma: None, iterations: 40 }]);
+        let outcome = run(&mut Gap::accelerated(Tv::new(0.1)), measurement, Start::Mean, &plan, &mut ()).unwrap();
+        assert_eq!(outcome.stop, StopReason::ScheduleDone);
+        (outcome.estimate.sensor - &truth).mapv(|d| d * d).mean().unwrap()
+    };
+    let [believed, left_out, one_sided] = [&believed, &left_out, &one_sided].map(error);
+    assert!(one_sided < 0.95 * left_out && left_out < 0.5 * believed, "{one_sided} {left_out} {believed}");
+}

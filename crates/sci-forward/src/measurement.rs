@@ -60,6 +60,8 @@ pub struct Measurement {
     scale: f64,
     /// Of each pixel of y, where noise is known of.
     variance: Option<Array2<f32>>,
+    /// What the sensor could not exceed.
+    clip: Option<f32>,
 }
 
 impl Measurement {
@@ -85,7 +87,7 @@ impl Measurement {
             return Err(MeasurementError::AllClosed);
         }
         let scale = if squares > 0.0 { squares.sqrt() } else { (open as f64).sqrt() };
-        Ok(Self { operator, y, cfa: None, scale, variance: None })
+        Ok(Self { operator, y, cfa: None, scale, variance: None, clip: None })
     }
 
     /// The same measurement by a sensor with this color filter array; `None` for a gray sensor.
@@ -109,6 +111,42 @@ impl Measurement {
     pub fn with_noise(self, noise: Option<Noise>) -> Self {
         let variance = noise.map(|noise| self.y.mapv(|y| noise.variance(y)));
         Self { variance: variance.filter(|variance| variance.iter().any(|&v| v > 0.0)), ..self }
+    }
+
+    /// The same measurement by a sensor that clips at a level, in the unit of y: pixels that have reached it say only that there was as
+    /// much light, or more. A level that is not a finite number above 0 is none.
+    pub fn with_clip(self, level: Option<f32>) -> Self {
+        Self { clip: level.filter(|level| *level > 0.0 && level.is_finite()), ..self }
+    }
+
+    /// The level at which the sensor clips, where one is known.
+    pub fn clip(&self) -> Option<f32> {
+        self.clip
+    }
+
+    /// What of y a video disagrees with that would give `hx`: y itself, but for a clipped pixel `hx` if that is more.
+    ///
+    /// ```
+    /// use ndarray::{Array3, array};
+    /// use sci_forward::{MaskOperator, MaskStack, Measurement};
+    /// use std::sync::Arc;
+    ///
+    /// let h = Arc::new(MaskOperator::new(MaskStack::new(Array3::ones((2, 1, 3)))?));
+    /// let measurement = Measurement::new(h, array![[0.5, 1.0, 1.0]])?.with_clip(Some(1.0));
+    /// let mut y = [0.5, 1.0, 1.0];
+    /// measurement.one_sided(&mut y, &[0.7, 0.7, 1.3]);
+    /// assert_eq!(y, [0.5, 1.0, 1.3]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # References
+    /// The constraint set of a clipped sample: Foucart, Needham, *Sparse recovery from saturated measurements*, 2017.
+    pub fn one_sided(&self, y: &mut [f32], hx: &[f32]) {
+        if let Some(level) = self.clip {
+            for (y, hx) in y.iter_mut().zip(hx) {
+                *y = if *y >= level && *hx > *y { *hx } else { *y };
+            }
+        }
     }
 
     /// The variance of the noise of each pixel `[H, W]`, where noise is known of.
@@ -174,10 +212,11 @@ impl Measurement {
         check("map of measured pixels", measured.shape(), self.shape().image_dim().into())?;
         let y = Zip::from(&self.y).and(measured).map_collect(|&y, &keep| if keep { y } else { 0.0 });
         let operator = Arc::new(Restricted::new(self.operator.clone(), measured));
-        Ok(Self { cfa: self.cfa, variance: self.variance.clone(), ..Self::new(operator, y)? })
+        Ok(Self { cfa: self.cfa, variance: self.variance.clone(), clip: self.clip, ..Self::new(operator, y)? })
     }
 
-    /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`, 0 at the pixels that are not open.
+    /// `r = H T v − y` `[H, W]` of a video `[T, C, H, W]`, 0 at the pixels that are not open, and at clipped ones that get more light than
+    /// they measure.
     ///
     /// # Errors
     /// [`MeasurementError::Size`] if `video` is not `[T, C, H, W]` with [`channels`](Self::channels) for C.
@@ -192,7 +231,11 @@ impl Measurement {
                 self.operator.forward(mosaic.view())
             }
         };
-        residual -= &self.y;
+        let mut y = self.y.clone();
+        if let (Some(y), Some(hx)) = (y.as_slice_mut(), residual.as_slice()) {
+            self.one_sided(y, hx);
+        }
+        residual -= &y;
         close(residual.view_mut(), self.operator.gram());
         Ok(residual)
     }

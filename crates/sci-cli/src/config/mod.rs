@@ -226,7 +226,7 @@ impl Experiment {
             denoiser.part.check(&Around {
                 solver: self.solver.kind,
                 accelerated: self.solver.method.accelerated(),
-                from_mean: self.solver.start == Start::Mean,
+                normalised: matches!(self.solver.start, Start::Mean | Start::Tv { .. }),
                 stages: &stages,
                 online: self.online.is_some(),
                 tiles: self.skip.is_some_and(|s| s.tiles),

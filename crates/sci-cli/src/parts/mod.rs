@@ -102,8 +102,8 @@ pub struct Around<'e> {
     pub solver: &'e str,
     /// Whether it is accelerated.
     pub accelerated: bool,
-    /// Whether it starts from the mean.
-    pub from_mean: bool,
+    /// Whether it starts from the mean, or from TV.
+    pub normalised: bool,
     /// For each stage whether it is one of this denoiser.
     pub stages: &'e [bool],
     /// Whether networks adapt.

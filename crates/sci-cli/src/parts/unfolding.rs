@@ -1,6 +1,6 @@
 //! `kind = "unfolding"`: the deep unfolding network, a prior that knows the measurement.
 //!
-//! It was trained as the whole of a solve: plain GAP from the mean, one of its iterations in each of the solver's. Fewer are a rougher
+//! It was trained as the whole of a solve: plain GAP from the mean or from TV (its card says which), one of its iterations in each of the solver's. Fewer are a rougher
 //! result, more repeat the last. Weights to ship go beside the others, in one line of `nets::weights`: `bundled:NAME` then knows them.
 
 use admm::{Call, Denoiser, Estimate, Prior, PriorError};
@@ -39,7 +39,11 @@ impl Part for Unfolding {
                 format!("is \"{}\", but {trained} plain GAP; legal: gap", around.solver),
             ),
             (!around.accelerated, "solver.accelerate", format!("is true, but {trained} plain GAP; legal: false")),
-            (around.from_mean, "solver.start", format!("is not the mean, which {trained}; legal: mean")),
+            (
+                around.normalised,
+                "solver.start",
+                format!("is neither the mean nor TV, which {trained}; legal: mean, tv"),
+            ),
             (!others_before, "stage", format!("begins with another denoiser, but {trained} solves from their start")),
             (!around.online, "online.enabled", "is true, but an unfolding network does not adapt; legal: false".into()),
             (
