@@ -59,7 +59,7 @@ fn a_file_says_only_where_it_differs() {
     assert_eq!(runs(&bench, "a.toml", &["stage.0.iterations=3"])["measurements"][0]["iterations"], 3);
     // A mistake is told with the file it is in.
     bench.write("sub/base.toml", config().replace("kind = \"tv\"", "kind = \"tv\"\ninner = 0"));
-    fails(&bench, "a.toml", &[], 2, &["sub/base.toml:12: `denoiser.inner` = 0", "1 to 1000"]);
+    fails(&bench, "a.toml", &[], 2, &["sub/base.toml:13: `denoiser.inner` = 0", "1 to 1000"]);
 }
 
 #[test]
@@ -135,7 +135,9 @@ fn an_unfolding_network_is_for_its_own_kind_of_sensor() {
     write_network(&bench, "net.safetensors", UnfoldingSpec { channels: 3, ..GRAY }, 0.0);
     fails(&bench, "base.toml", &[UNFOLDING], 1, &["denoiser.weights", "3 channels", "is gray", "data.cfa"]);
     let record = runs(&bench, "base.toml", &[UNFOLDING, "data.cfa=bggr", "stage.0.iterations=2"]);
-    assert!(record["measurements"][0]["psnr_rgb_db"].as_f64().unwrap() > 10.0);
+    assert!(record["measurements"][0]["psnr_db"].as_f64().unwrap() > 10.0);
+    let recon = read_npy::<_, ArrayD<f32>>(bench.path("out/recon.npy")).unwrap();
+    assert!(recon.ndim() == 4 && recon.shape().contains(&3), "{:?}", recon.shape());
     write_network(&bench, "net.safetensors", GRAY, 0.0);
     fails(&bench, "base.toml", &[UNFOLDING, "data.cfa=bggr"], 1, &["denoiser.weights", "1 channels", "is color"]);
 }
