@@ -31,6 +31,8 @@ pub struct PathSetting {
 pub struct Data {
     /// The scene or the video.
     pub path: PathSetting,
+    /// The masks' own file.
+    pub mask: Option<PathSetting>,
     /// Measurements to reconstruct, `None` for all.
     pub measurements: Option<Vec<usize>>,
     /// How to understand the file.
@@ -299,8 +301,8 @@ impl<'s> Checker<'s> {
     fn data(&self, mut section: Section<'s>, seed: u64) -> Result<Data, ConfigError> {
         let span = section.span.clone();
         let kind = section.take_kind(&["scene", "simulate"], Some("scene"))?;
-        let names = section.take("keys")?;
-        let mut also = vec!["kind", "keys"];
+        let (names, raw) = (section.take("keys")?, section.take("raw")?);
+        let mut also = vec!["kind", "keys", "raw"];
         let simulate = if kind.get_ref() == "simulate" {
             also.extend(["mask", "noise"]);
             let (mask, noise) = (section.take("mask")?, section.take("noise")?);
@@ -311,8 +313,10 @@ impl<'s> Checker<'s> {
             None
         };
         let k: DataKeys = section.read(&also)?;
+        let shift = self.mask_shift(&k.mask_shift, &k.frames, simulate.is_some())?;
         Ok(Data {
             path: self.path("data.path", k.path, &span)?,
+            mask: k.mask.map(|mask| self.path("data.mask", Some(mask), &span)).transpose()?,
             measurements: self.measurements(k.measurements)?,
             reading: Reading {
                 keys: self.part_names(names)?,
@@ -320,6 +324,10 @@ impl<'s> Checker<'s> {
                 scale: self.number("data.scale", &k.scale, 1e-6..=1e6)?.map(|s| s as f32),
                 cfa: self.choice("data.cfa", &k.cfa, &PATTERNS)?,
                 defects: self.choice("data.defects", &k.defects, &DEFECTS)?.unwrap_or_default(),
+                // Found once all is checked.
+                mask: None,
+                shift,
+                raw: raw.map(|section| self.raw(section)).transpose()?,
             },
             simulate,
         })
@@ -693,7 +701,7 @@ impl<'s> Checker<'s> {
         })
     }
 
-    fn value_error(&self, key: &str, span: &Range<usize>, legal: &str) -> ConfigError {
+    pub(super) fn value_error(&self, key: &str, span: &Range<usize>, legal: &str) -> ConfigError {
         self.source.error(span, format!("`{key}` = {} is not legal; legal: {legal}", self.source.snippet(span)))
     }
 

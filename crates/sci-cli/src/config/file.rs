@@ -24,7 +24,7 @@ pub struct TopKeys {
     pub schedule: Value,
 }
 
-/// `[data]` of either kind; `[data.keys]`, `[data.mask]` and `[data.noise]` are read apart.
+/// `[data]` of either kind; `[data.keys]`, `[data.raw]`, and `[data.mask]` and `[data.noise]` of a simulation are read apart.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
@@ -35,6 +35,19 @@ pub struct DataKeys {
     pub scale: Value,
     pub cfa: Value,
     pub defects: Value,
+    pub mask: Value,
+    pub mask_shift: Value,
+    pub frames: Value,
+}
+
+/// `[data.raw]`: what a file without a header does not say.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct RawKeys {
+    pub format: Value,
+    pub height: Value,
+    pub width: Value,
 }
 
 /// `[data.keys]`: the names of a scene's parts in its file.

@@ -5,6 +5,7 @@
 //! and line (or the `--set` argument), the key, the value and what is legal.
 
 pub mod adaptation;
+mod camera;
 pub mod check;
 pub mod denoising;
 pub mod file;

@@ -201,10 +201,11 @@ fn resolve(checked: Checked, source: &Source, written: Written) -> Result<Experi
             seed: s.seed,
         }),
     };
+    let mask = checked.data.mask.as_ref().map(find).transpose()?;
     let data = Data {
         path: find(&checked.data.path)?,
         measurements: checked.data.measurements,
-        reading: checked.data.reading,
+        reading: Reading { mask, ..checked.data.reading },
         simulate,
     };
     let denoisers = checked
@@ -367,7 +368,7 @@ impl Experiment {
     pub fn inputs(&self) -> Vec<(&'static str, &Path)> {
         let mask = match &self.data.simulate {
             Some(Simulate { mask: MaskSource::File(path), .. }) => Some(("data.mask.path", path)),
-            _ => None,
+            _ => self.data.reading.mask.as_ref().map(|path| ("data.mask", path)),
         };
         let demosaicer = match &self.demosaicer {
             Some(Demosaicer::Ddnet { weights }) => Some(("solver.weights", weights)),
@@ -427,6 +428,16 @@ impl Experiment {
             "cfa": d.reading.cfa.map(|c| c.to_string().to_lowercase()),
             "defects": if d.reading.defects == Defects::Exclude { "exclude" } else { "keep" },
         });
+        if let Some(mask) = &d.reading.mask {
+            value["mask"] = json!(mask.to_string_lossy());
+        }
+        if let Some(shift) = &d.reading.shift {
+            value["mask_shift"] = json!(shift.step);
+            value["frames"] = json!(shift.frames);
+        }
+        if let Some(raw) = &d.reading.raw {
+            value["raw"] = json!({ "format": raw.packing.name(), "height": raw.height, "width": raw.width });
+        }
         if let Some(s) = &d.simulate {
             let random = |kind, r: &RandomMask| json!({ "kind": kind, "frames": r.frames, "density": r.density, "seed": r.seed });
             value["mask"] = match &s.mask {
