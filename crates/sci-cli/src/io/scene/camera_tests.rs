@@ -228,7 +228,7 @@ fn twelve_bits_in_sixteen_are_said() {
     let worst = (&scene.measurements - &(meas() / 4095.0)).fold(0f32, |worst, d| worst.max(d.abs()));
     assert!(worst < 1e-6, "{worst}");
     let video =
-        read_video(&dir.tiff16("video.tif", &(meas() + Array3::zeros((5, 6, 8)))), &Reading::default()).unwrap();
+        read_video(&dir.tiff16("video.tif", &(meas() + Array3::<f32>::zeros((5, 6, 8)))), &Reading::default()).unwrap();
     assert!(video.notes[0].contains("hold 12"), "{:?}", video.notes);
     assert_eq!(video.frames[[4, 0, 3, 2]], meas()[[0, 3, 2]] / 4095.0);
 }
