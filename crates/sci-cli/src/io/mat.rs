@@ -296,8 +296,11 @@ impl Walk<'_> {
     }
 }
 
-/// A member of a struct or a cell: its head, and a reader of the rest of it; `None` if it is empty.
-fn member<'r>(r: &'r mut dyn Read, endian: Endian) -> Result<Option<(Head, io::Take<&'r mut dyn Read>)>, ReadError> {
+/// A member of a struct or a cell: its head, and a reader of the rest of it.
+type Member<'r> = (Head, io::Take<&'r mut dyn Read>);
+
+/// The next member, `None` if it is empty.
+fn member(r: &mut dyn Read, endian: Endian) -> Result<Option<Member<'_>>, ReadError> {
     let mut r = r;
     let (kind, size) = tag(&mut r, endian)?;
     if kind != MI_MATRIX {

@@ -215,7 +215,7 @@ fn contiguous(
     };
     let starts = pages.find_tag_unsigned_vec::<u64>(Tag::StripOffsets).map_err(bad)?.unwrap_or_default();
     let start = starts.iter().min().and_then(|&at| usize::try_from(at).ok()).unwrap_or(usize::MAX);
-    let count = images.checked_mul(plan.pixels()).unwrap_or(usize::MAX);
+    let count = images.saturating_mul(plan.pixels());
     let end = count.checked_mul(kind.size()).and_then(|n| n.checked_add(start));
     let raw = end.and_then(|end| bytes.get(start..end)).ok_or_else(|| {
         bad(format!("cut short: {images} images of {}×{} pixels are more than the file holds", plan.width, plan.height))
