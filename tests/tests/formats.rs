@@ -86,6 +86,7 @@ fn mat_v73_has_reversed_axes() {
             .collect()
     };
     let mut file = hdf5_pure::FileBuilder::new();
+    file.with_userblock(512).with_userblock_content(b"MATLAB 7.3 MAT-file");
     file.create_dataset("mask").with_u8_data(&matlab(2, &mask)).with_shape(&[2, w as u64, h as u64]);
     file.create_dataset("orig").with_u8_data(&matlab(4, &orig)).with_shape(&[4, w as u64, h as u64]);
     let hdf5 = file.finish().unwrap();
@@ -106,6 +107,49 @@ fn mat_v73_has_reversed_axes() {
     assert_eq!(recon(&bench, "plain.mat", &[]), recon(&bench, "folder", &[]));
     let darker = recon(&bench, "folder", &["--set", "data.scale=510"]);
     assert_ne!(darker, recon(&bench, "folder", &[]));
+}
+
+/// Stands in for ffmpeg: a script that gives two frames, whatever it is asked for.
+#[cfg(unix)]
+#[test]
+fn clips_are_simulated_from_through_ffmpeg() {
+    use std::os::unix::fs::PermissionsExt;
+    let bench = bench();
+    bench.write("clip.mp4", b"\0\0\0\x20ftypisom");
+    let args = ["simulate", "clip.mp4", "--frames", "2", "--out", "s.npz"];
+    let without = bench.command(&args).env("PATH", bench.path("nowhere")).output().unwrap();
+    let said = String::from_utf8_lossy(&without.stderr).into_owned();
+    assert!(without.status.code() == Some(1) && said.contains("clip.mp4") && said.contains("ffmpeg"), "{said}");
+    fs::create_dir(bench.path("bin")).unwrap();
+    let picture = r"printf 'P6\n4 2\n255\n'; printf 'abcabcdefdefghighijkljkl'";
+    bench.write("bin/ffmpeg", format!("#!/bin/sh\n{picture}\n{picture}\n"));
+    fs::set_permissions(bench.path("bin/ffmpeg"), fs::Permissions::from_mode(0o755)).unwrap();
+    let with = bench.command(&args).env("PATH", bench.path("bin")).output().unwrap();
+    let said = String::from_utf8_lossy(&with.stdout).into_owned();
+    assert!(said.contains("1 measurements of 2 frames of 2×4"), "{said}{}", String::from_utf8_lossy(&with.stderr));
+}
+
+#[test]
+fn masks_in_a_file_of_their_own_and_mistakes_about_them() {
+    let bench = bench();
+    bench.write("clip.y4m", y4m());
+    ok(&bench, &["mask", "--kind", "shifting", "--frames", "4", "--size", "16x24", "--seed", "3", "--out", "m.npy"]);
+    ok(&bench, &["simulate", "clip.y4m", "--mask-file", "m.npy", "--out", "s.npz"]);
+    let together = recon(&bench, "s.npz", &[]);
+    assert_eq!(together, recon(&bench, "s.npz", &["--set", "data.mask=m.npy"]));
+    for (setting, part) in [
+        ("data.mask_shift=[1, 0]", "data.frames"),
+        ("data.frames=4", "data.mask_shift"),
+        ("data.raw={format=\"mono12p\", height=3}", "data.raw.width"),
+        ("data.raw={format=\"mono13\", height=3, width=3}", "mono12packed"),
+        ("data.mask=nowhere.npy", "nowhere.npy"),
+    ] {
+        let run = bench.sci(&["run", "a.toml", "--out", "out", "--set", "data.path=s.npz", "--set", setting]);
+        assert!(run.code != 0 && run.stderr.contains(part), "{setting}: {}", run.stderr);
+    }
+    let moved = ["--set", "data.mask_shift=[0, 65]", "--set", "data.frames=4"];
+    let run = bench.sci(&[&["run", "a.toml", "--out", "out", "--set", "data.path=s.npz"], &moved[..]].concat());
+    assert!(run.code != 0 && run.stderr.contains("from -64 to 64"), "{}", run.stderr);
 }
 
 #[test]

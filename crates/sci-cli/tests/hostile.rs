@@ -10,7 +10,7 @@ use ndarray::{Array3, Array4};
 use sci_cli::config;
 use sci_cli::io::mat::{self, Variable};
 use sci_cli::io::samples::Budget;
-use sci_cli::io::{frames, npy, video};
+use sci_cli::io::{frames, hdf5, npy, tiff, video};
 use sci_cli::table::Source;
 
 /// The system's allocator, counting what is held, and the most that ever was.
@@ -128,6 +128,28 @@ fn damaged_files_are_harmless() {
     hdf5.create_dataset("meas").with_u8_data(&[7; 70]).with_shape(&[2, 5, 7]).with_chunks(&[1, 5, 7]).with_deflate(6);
     check(".mat v7.3", &hdf5.finish().unwrap(), |b| mat::read(b, &["mask", "meas"]).is_ok());
 
+    let mut matlab = hdf5_pure::mat::MatBuilder::new(hdf5_pure::mat::Options::default());
+    matlab.struct_("data", |s| s.write_f32("mask", &[7, 10], &data).map(drop)).unwrap();
+    matlab.cell("frames", &[1, 2], |c| c.push_u8(&[2, 1], &[1, 2])?.push_u8(&[2, 1], &[3, 4]).map(drop)).unwrap();
+    matlab.write_complex_f64("meas", &[2, 1], &[(5.0, 0.0), (6.0, 0.0)]).unwrap();
+    let matlab = matlab.finish().unwrap();
+    check(".mat v7.3, nested", &matlab, |b| hdf5::read(b, &["data.mask", "frames", "meas"]).is_ok());
+    let mut lzf = hdf5_pure::FileBuilder::new();
+    lzf.create_dataset("mask").with_u8_data(&[7; 4096]).with_shape(&[64, 64]).with_chunks(&[32, 64]).with_lzf();
+    check(".h5, LZF", &lzf.finish().unwrap(), |b| hdf5::read(b, &["mask"]).is_ok());
+
+    for compression in [::tiff::encoder::Compression::Lzw, ::tiff::encoder::Compression::Uncompressed] {
+        let mut file = Cursor::new(Vec::new());
+        let mut pages = ::tiff::encoder::TiffEncoder::new(&mut file).unwrap().with_compression(compression);
+        for page in ramp.outer_iter() {
+            let mut image = pages.new_image::<::tiff::encoder::colortype::Gray32Float>(7, 5).unwrap();
+            let description = "ImageJ=1.54f\nimages=2\nframes=2\n";
+            image.encoder().write_tag(::tiff::tags::Tag::ImageDescription, description).unwrap();
+            image.write_data(page.to_slice().unwrap()).unwrap();
+        }
+        check(".tif", file.get_ref(), |b| tiff::read(b).is_ok());
+    }
+
     let mut bytes = Vec::new();
     npy::write_npy(&mut bytes, &ramp).unwrap();
     check(".npy", &bytes, |b| npy::read_npy(b).is_ok());
@@ -143,6 +165,10 @@ fn damaged_files_are_harmless() {
     let mut y4m = b"YUV4MPEG2 W6 H4 F25:1 C420jpeg\nFRAME\n".to_vec();
     y4m.extend([100; 36]);
     check(".y4m", &y4m, |b| video::read_y4m(b).is_ok());
+
+    let mut y4m = b"YUV4MPEG2 W6 H4 F25:1 C420p10\nFRAME\n".to_vec();
+    y4m.extend([1; 72]);
+    check(".y4m, 10 bits", &y4m, |b| video::read_y4m(b).is_ok());
 
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.png");

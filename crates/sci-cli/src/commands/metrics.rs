@@ -1,8 +1,8 @@
 //! `sci metrics A B`: the numbers of the papers between two videos.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use ndarray::{Axis, s};
+use ndarray::{Array3, Axis, s};
 use sci_forward::metrics::{psnr, ssim, ssim_gaussian};
 
 use super::Done;
@@ -26,8 +26,13 @@ pub(super) struct Args {
 impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
         let reading = Reading { keys: scene::Keys { rgb: "recon".into(), ..Default::default() }, ..Default::default() };
-        let a = scene::read_gray_video(&self.a, &reading)?;
-        let b = scene::read_gray_video(&self.b, &Reading::default())?;
+        let gray = |path: &Path, reading: &Reading| -> anyhow::Result<Array3<f32>> {
+            let video = scene::read_gray_video(path, reading)?;
+            video.notes.iter().for_each(|note| eprintln!("warning: {}: {note}", path.display()));
+            Ok(video.frames.index_axis_move(Axis(1), 0))
+        };
+        let a = gray(&self.a, &reading)?;
+        let b = gray(&self.b, &Reading::default())?;
         let ((na, ha, wa), (nb, hb, wb)) = (a.dim(), b.dim());
         anyhow::ensure!(
             (ha, wa) == (hb, wb),

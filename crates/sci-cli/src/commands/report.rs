@@ -158,7 +158,9 @@ fn result(dir: &Path, record: &Record, unit: f32) -> anyhow::Result<Array4<f32>>
     let arrays = ["recon.npy", "recon.npz", "recon.mat"].into_iter().find(|name| listed(name));
     let keys = Keys { orig: "recon".into(), rgb: "recon".into(), ..Default::default() };
     if let Some(name) = arrays {
-        let video = scene::read_video(&dir.join(name), &Reading { keys, ..Default::default() })?;
+        // The program's own habits, whatever the numbers look like.
+        let scale = Some(if name.ends_with(".mat") { 255.0 } else { 1.0 });
+        let video = scene::read_video(&dir.join(name), &Reading { keys, scale, ..Default::default() })?.frames;
         return Ok(if unit == 1.0 { video } else { video / unit });
     }
     let frames = dir.join("frames");
@@ -167,5 +169,5 @@ fn result(dir: &Path, record: &Record, unit: f32) -> anyhow::Result<Array4<f32>>
         "{}: neither recon.npy, recon.npz, recon.mat nor frames to make a page of",
         dir.display()
     );
-    Ok(scene::read_video(&frames, &Reading::default())?)
+    Ok(scene::read_video(&frames, &Reading::default())?.frames)
 }

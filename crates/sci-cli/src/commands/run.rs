@@ -154,30 +154,38 @@ fn result_shape(scene: &Scene) -> [usize; 4] {
 pub(super) fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
     let data = &experiment.data;
     let Some(s) = &data.simulate else { return Ok(scene::read(&data.path, &data.reading)?) };
-    let video = match data.reading.cfa {
-        None => scene::read_gray_video(&data.path, &data.reading)?.insert_axis(Axis(1)),
+    let scene::Video { frames: video, mut notes } = match data.reading.cfa {
+        None => scene::read_gray_video(&data.path, &data.reading)?,
         Some(_) => scene::read_video(&data.path, &data.reading)?,
     };
     let (_, channels, height, width) = video.dim();
     // A single channel of a color sensor is its mosaic.
     let truth = if channels == 3 { Truth::Rgb(video) } else { Truth::Sensor(video.index_axis_move(Axis(1), 0)) };
-    let masks = masks(s, &data.reading, height, width)?;
+    let masks = masks(s, &data.reading, (height, width), &mut notes)?;
     let noise = SeededNoise { noise: Noise::new(s.photons, f64::from(s.sigma))?, seed: s.seed };
-    Ok(simulate(&data.path.display().to_string(), &data.reading.keys, masks, truth, data.reading.cfa, noise)?)
+    let file = data.path.display().to_string();
+    let mut scene = simulate(&file, &data.reading.keys, masks, truth, data.reading.cfa, noise)?;
+    notes.append(&mut scene.warnings);
+    scene.warnings = notes;
+    Ok(scene)
 }
 
 fn masks(
     s: &Simulate,
     reading: &scene::Reading,
-    height: usize,
-    width: usize,
+    (height, width): (usize, usize),
+    notes: &mut Vec<String>,
 ) -> anyhow::Result<sci_forward::MaskStack> {
     use sci_forward::MaskStack;
     let shape = |frames| VideoShape { frames, height, width };
     Ok(match &s.mask {
         MaskSource::Random(r) => MaskStack::random(shape(r.frames), r.density, r.seed)?,
         MaskSource::Shifting(r) => MaskStack::shifting(shape(r.frames), r.density, r.seed)?,
-        MaskSource::File(path) => scene::read_mask(path, reading)?,
+        MaskSource::File(path) => {
+            let (masks, said) = scene::read_mask(path, reading)?;
+            notes.extend(said);
+            masks
+        }
     })
 }
 

@@ -14,7 +14,8 @@ use crate::simulate::{SeededNoise, simulate};
 /// Arguments of `sci simulate`.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
-    /// The video: .gif, .y4m, a folder of pictures, .npy, .npz or .mat; color becomes gray without --cfa
+    /// The video: .mp4 or .avi (by ffmpeg), .gif, .y4m, .tif, a folder of pictures, .npy, .npz, .h5 or .mat; color becomes gray without
+    /// --cfa
     video: PathBuf,
     /// Where to write the scene: .npz or .mat
     #[arg(long, value_name = "FILE")]
@@ -25,7 +26,7 @@ pub(super) struct Args {
     /// How the masks' pixels open
     #[arg(long, value_enum, default_value = "random")]
     mask: Kind,
-    /// Take the masks from a file instead: .npy, .npz, .mat or a folder of pictures
+    /// Take the masks from a file instead: .npy, .npz, .h5, .mat, .tif or a folder of pictures
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mask", "frames", "density"])]
     mask_file: Option<PathBuf>,
     /// Frames a measurement sums
@@ -76,6 +77,10 @@ fn parse_photons(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|p| (1e-3..=1e9).contains(p)).ok_or_else(|| "expected a number from 0.001 to 1e9".into())
 }
 
+fn say(warnings: &[String]) {
+    warnings.iter().for_each(|w| eprintln!("warning: {w}"));
+}
+
 impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
         let format = array_format(&self.out)?;
@@ -87,14 +92,19 @@ impl Args {
             .into());
         }
         let cfa = self.cfa.map(CfaPattern::from);
-        let mut truth = match cfa {
-            None => scene::read_gray_video(&self.video, &Reading::default())?.insert_axis(Axis(1)),
+        let scene::Video { frames: mut truth, notes } = match cfa {
+            None => scene::read_gray_video(&self.video, &Reading::default())?,
             Some(_) => scene::read_video(&self.video, &Reading::default())?,
         };
+        say(&notes);
         let (_, channels, height, width) = truth.dim();
         anyhow::ensure!(cfa.is_none() || channels == 3, "{}: --cfa needs a video in color", self.video.display());
         let masks = match &self.mask_file {
-            Some(file) => scene::read_mask(file, &Reading::default())?,
+            Some(file) => {
+                let (masks, notes) = scene::read_mask(file, &Reading::default())?;
+                say(&notes);
+                masks
+            }
             None => {
                 self.mask.masks(VideoShape { frames: self.frames.into(), height, width }, self.density, self.seed)?
             }
@@ -113,7 +123,7 @@ impl Args {
         let noise = SeededNoise { noise, seed: self.seed };
         let truth = if cfa.is_some() { Truth::Rgb(truth) } else { Truth::Sensor(truth.index_axis_move(Axis(1), 0)) };
         let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, noise)?;
-        scene.warnings.iter().for_each(|w| eprintln!("warning: {w}"));
+        say(&scene.warnings);
         let mask = scene.operator.adjoint(Array2::ones((height, width)).view());
         let truth = match (&scene.rgb, &scene.truth) {
             (Some(rgb), _) => Part { name: "rgb", data: rgb.view(), is_light: true },

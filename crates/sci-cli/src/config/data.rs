@@ -2,11 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use sci_forward::CfaPattern;
+use sci_forward::{CfaPattern, Noise};
+use serde_json::json;
 
 use crate::io::defects::Defects;
-use crate::io::scene::{Axes, Keys, Reading};
-use crate::table::{ConfigError, Table};
+use crate::io::raw::{Packing, Raw};
+use crate::io::scene::{Axes, Clip, Keys, MaskShift, Reading, Sensor};
+use crate::table::{ConfigError, Table, as_number};
 
 /// Where the measurements come from.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,6 +21,19 @@ pub struct Data {
     pub reading: Reading,
     /// Set if `path` is a video whose measurements are simulated.
     pub simulate: Option<Simulate>,
+    /// How the masks are found to sit.
+    pub calibration: Calibration,
+}
+
+/// How masks are found to sit on the sensor.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Calibration {
+    /// As the file has them.
+    None,
+    /// From the measurements, before the first is solved.
+    Auto,
+    /// As `sci calibrate` has found it: its file, absolute.
+    File(PathBuf),
 }
 
 /// What turns a video into measurements.
@@ -66,6 +81,7 @@ impl Data {
         let simulated = t.kind(&["scene", "simulate"], Some("scene"))? == "simulate";
         let keys = t.part("keys", |t| Ok(part_names(t)))?;
         let simulate = if simulated { Some(Simulate::read(t, seed)?) } else { None };
+        let mask = if !simulated && t.holds("mask") { Some(t.path("mask")) } else { None };
         Ok(Self {
             path: t.path("path"),
             measurements: measurements(t),
@@ -75,18 +91,92 @@ impl Data {
                 scale: t.optional_number("scale", 1e-6..=1e6).map(|s| s as f32),
                 cfa: t.optional_choice("cfa", &PATTERNS),
                 defects: t.choice("defects", &DEFECTS, Defects::default()),
+                mask,
+                shift: mask_shift(t, simulated),
+                raw: if t.holds("raw") { Some(t.part("raw", |t| Ok(raw(t)))?) } else { None },
+                sensor: t.part("sensor", |t| Ok(sensor(t)))?,
             },
             simulate,
+            calibration: calibration(t),
         })
     }
 
-    /// The file of masks, if there is one.
-    pub(super) fn mask_file(&self) -> Option<&Path> {
-        match &self.simulate {
-            Some(Simulate { mask: MaskSource::File(path), .. }) => Some(path),
+    /// The files beside `data.path`, with their keys.
+    pub(super) fn other_files(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+        let mask = match &self.simulate {
+            Some(Simulate { mask: MaskSource::File(path), .. }) => Some(("data.mask.path", path.as_path())),
+            _ => self.reading.mask.as_deref().map(|path| ("data.mask", path)),
+        };
+        let calibration = match &self.calibration {
+            Calibration::File(path) => Some(("data.calibration", path.as_path())),
             _ => None,
-        }
+        };
+        mask.into_iter().chain(calibration)
     }
+}
+
+/// `data.mask_shift` and `data.frames`, which go together.
+fn mask_shift(t: &mut Table<'_>, simulated: bool) -> Option<MaskShift> {
+    if simulated {
+        t.idle(&["mask_shift", "frames"], "a scene's own masks: a simulation has [data.mask]");
+        return None;
+    }
+    if !t.holds("mask_shift") {
+        t.idle(&["frames"], "data.mask_shift, by which one mask moves: two numbers from -64 to 64, for example [1, 0]");
+        return None;
+    }
+    let legal = "two numbers from -64 to 64, the pixels down and right from a frame to the next, for example [1, 0]";
+    let step = t.legal("mask_shift", legal, |v| {
+        let both: Option<Vec<f64>> = v.as_array()?.iter().map(as_number).collect();
+        <[f64; 2]>::try_from(both?).ok().filter(|both| both.iter().all(|v| v.abs() <= 64.0))
+    });
+    t.show("mask_shift", step.map(|step| json!(step)));
+    Some(MaskShift { step: step.unwrap_or_default(), frames: t.required_whole("frames", 2..=1024) })
+}
+
+/// `[data.raw]`: a raw file says neither size nor packing.
+fn raw(t: &mut Table<'_>) -> Raw {
+    let packing = t.optional_choice("format", &Packing::ALL);
+    if packing.is_none() && !t.given("format") {
+        let names: Vec<&str> = Packing::ALL.iter().map(|(name, _)| *name).collect();
+        t.complain(format!("`data.raw.format` is missing; legal: {}", names.join(", ")));
+    }
+    Raw {
+        packing: packing.unwrap_or(Packing::Mono8),
+        height: t.required_whole("height", 1..=65_536),
+        width: t.required_whole("width", 1..=65_536),
+    }
+}
+
+/// `[data.sensor]`.
+fn sensor(t: &mut Table<'_>) -> Sensor {
+    let photons = t.optional_number("photons", 1e-3..=1e9);
+    let sigma = t.sigma("noise", 0.0);
+    let legal = "\"auto\", \"none\", or a number above 0 in the unit of the file";
+    let clip = t.legal("clip", legal, |v| match (v.as_str(), as_number(v)) {
+        (Some("auto"), _) => Some(Clip::Auto),
+        (Some("none"), _) => Some(Clip::None),
+        (None, Some(level)) if level > 0.0 && level.is_finite() => Some(Clip::Level(level as f32)),
+        _ => None,
+    });
+    let clip = clip.unwrap_or_default();
+    t.show("clip", clip.to_json());
+    Sensor {
+        black: t.number("black", 0.0, -1e6..=1e6) as f32,
+        // In range, which is all that can be wrong.
+        noise: Noise::new(photons, f64::from(sigma)).ok().filter(|_| photons.is_some() || sigma > 0.0),
+        clip,
+    }
+}
+
+fn calibration(t: &mut Table<'_>) -> Calibration {
+    if t.word("calibration", "none") {
+        return Calibration::None;
+    }
+    if t.word("calibration", "auto") {
+        return Calibration::Auto;
+    }
+    if t.holds("calibration") { Calibration::File(t.path("calibration")) } else { Calibration::None }
 }
 
 fn part_names(t: &mut Table<'_>) -> Keys {

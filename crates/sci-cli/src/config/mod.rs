@@ -20,7 +20,7 @@ use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
 
 pub use crate::table::ConfigError;
-pub use data::{Data, MaskSource, RandomMask, Simulate};
+pub use data::{Calibration, Data, MaskSource, RandomMask, Simulate};
 pub use online::Online;
 pub use output::Output;
 pub use skip::Skip;
@@ -265,7 +265,7 @@ impl Experiment {
             self.denoisers.iter().filter_map(|d| Some(("denoiser.weights", d.part.network()?.weights.as_path())));
         let all = [("data.path", self.data.path.as_path())]
             .into_iter()
-            .chain(self.data.mask_file().map(|path| ("data.mask.path", path)))
+            .chain(self.data.other_files())
             .chain(demosaicer.map(|path| ("solver.weights", path)))
             .chain(networks);
         all.filter(|(_, path)| !path.to_string_lossy().starts_with("bundled:")).collect()

@@ -1,4 +1,4 @@
-//! Owns folders of PNG or JPEG frames: one file a frame, in the natural order of their names.
+//! Owns pictures, and folders of them in the natural order of their names: PNG, JPEG, and the pages of TIFF files.
 
 use std::fs;
 use std::io::Cursor;
@@ -10,19 +10,23 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageRe
 use ndarray::{Array3, ArrayView3};
 
 use super::samples::{Array, Budget, SampleType, Samples};
-use super::{FileError, Format, ReadError, read_file};
+use super::{FileError, Format, ReadError, read_file, tiff};
 
 /// The `.png`, `.jpg` and `.jpeg` files of a folder, `frame2.png` before `frame10.png`.
 ///
 /// # Errors
 /// The folder's own error, or [`ReadError::NoFrames`] if it holds none.
 pub fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    list_named(folder, &["png", "jpg", "jpeg"])
+}
+
+fn list_named(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, FileError> {
     let io = |source| FileError::new(folder, ReadError::Io(source));
     let mut paths = Vec::new();
     for entry in fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
         let is = |known: &&str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(known));
-        if ["png", "jpg", "jpeg"].iter().any(is) {
+        if extensions.iter().any(is) {
             paths.push(path);
         }
     }
@@ -54,35 +58,81 @@ fn natural_key(name: &str) -> Vec<(String, u64)> {
     key
 }
 
-/// Reads a folder of equally large pictures as a video `[T, C, H, W]`, C = 1 if every frame is gray, else 3.
+/// Reads a folder of equally large pictures as a video `[T, C, H, W]`, C = 1 if every frame is gray, else 3; a TIFF may hold several.
 ///
-/// Samples are 0 to 255 for 8-bit files and 0.0 to 1.0 for 16-bit ones; transparency is dropped.
+/// Samples are as stored, 0 to 255 or to 65535; transparency is dropped.
 ///
 /// # Errors
 /// [`FileError`] naming the folder or the frame at fault.
 pub fn read(folder: &Path) -> Result<Array, FileError> {
-    let paths = list(folder)?;
-    let mut images = Vec::with_capacity(paths.len());
+    let paths = list_named(folder, &["png", "jpg", "jpeg", "tif", "tiff"])?;
+    let mut pictures: Vec<Array> = Vec::with_capacity(paths.len());
     for path in &paths {
-        let image = decode(&read_file(path)?).map_err(|e| FileError::new(path, e))?;
-        if let Some(first) = images.first().map(|i: &DynamicImage| (i.width(), i.height())) {
-            let size = (image.width(), image.height());
-            if size != first {
-                return Err(FileError::new(
-                    path,
-                    ReadError::Malformed {
-                        format: "frame",
-                        reason: format!(
-                            "{}×{} pixels, but the first frame has {}×{}",
-                            size.0, size.1, first.0, first.1
-                        ),
-                    },
-                ));
-            }
-        }
-        images.push(image);
+        let bytes = read_file(path)?;
+        let picture = match Format::of(&bytes) {
+            Ok(Format::Tiff) => tiff::read(&bytes),
+            _ => read_picture(&bytes),
+        };
+        let picture = picture.and_then(|p| if let Some(first) = pictures.first() { fitting(p, first) } else { Ok(p) });
+        pictures.push(picture.map_err(|e| FileError::new(path, e))?);
     }
-    to_video(&images).map_err(|e| FileError::new(folder, e))
+    join(pictures).map_err(|e| FileError::new(folder, e))
+}
+
+/// The picture, if it is as large as the first one and its samples can stand beside it.
+fn fitting(picture: Array, first: &Array) -> Result<Array, ReadError> {
+    let size = |a: &Array| (a.shape()[3], a.shape()[2]);
+    let bad = |reason| Err(ReadError::Malformed { format: "frame", reason });
+    if size(&picture) != size(first) {
+        let ((w, h), (first_w, first_h)) = (size(&picture), size(first));
+        return bad(format!("{w}×{h} pixels, but the first frame has {first_w}×{first_h}"));
+    }
+    let whole = [SampleType::U8, SampleType::U16];
+    if picture.stored() != first.stored() && ![picture.stored(), first.stored()].iter().all(|s| whole.contains(s)) {
+        return bad(format!("samples of type {:?}, but the first frame has {:?}", picture.stored(), first.stored()));
+    }
+    Ok(picture)
+}
+
+/// Pictures `[T, C, H, W]` one after the other; gray ones are repeated among color, 8 bits stretched to 16 among such.
+fn join(pictures: Vec<Array>) -> Result<Array, ReadError> {
+    let Some(first) = pictures.first() else { return Err(ReadError::NoFrames) };
+    let (h, w) = (first.shape()[2], first.shape()[3]);
+    let channels = pictures.iter().map(|p| p.shape()[1]).max().unwrap_or(1);
+    let mixed = pictures.iter().any(|p| p.stored() != first.stored());
+    let stored = if mixed { SampleType::U16 } else { first.stored() };
+    let white = first.white().filter(|_| pictures.iter().all(|p| p.white() == first.white()));
+    let frames = pictures.iter().map(|p| p.shape()[0]).sum();
+    let mut all: Option<Samples> = None;
+    for picture in pictures {
+        let repeat = channels / picture.shape()[1];
+        let stretch = mixed && picture.stored() == SampleType::U8;
+        let mut samples = picture.into_samples();
+        if stretch {
+            samples = Samples::Floats((0..samples.len()).map(|i| samples.at(i) * 257.0).collect());
+        }
+        if repeat > 1 {
+            let planes: Vec<usize> = (0..samples.len() / (h * w)).flat_map(|t| [t; 3]).collect();
+            samples = samples.in_order(&planes, h * w);
+        }
+        match &mut all {
+            None => all = Some(samples),
+            Some(all) => all.append(samples),
+        }
+    }
+    let array = Array::new(vec![frames, channels, h, w], all.ok_or(ReadError::NoFrames)?, stored)?;
+    Ok(match white {
+        Some(white) => array.with_white(white),
+        None => array,
+    })
+}
+
+/// Reads one PNG or JPEG as `[1, C, H, W]`, C = 1 or 3, samples as stored.
+///
+/// # Errors
+/// As [`decode`].
+pub fn read_picture(bytes: &[u8]) -> Result<Array, ReadError> {
+    to_video(&decode(bytes)?)
 }
 
 /// Decodes one PNG or JPEG, within the budget of its own size.
@@ -109,40 +159,30 @@ pub fn decode(bytes: &[u8]) -> Result<DynamicImage, ReadError> {
     DynamicImage::from_decoder(decoder).map_err(broken)
 }
 
-fn to_video(images: &[DynamicImage]) -> Result<Array, ReadError> {
-    let gray = images.iter().all(|i| !i.color().has_color());
-    let deep = images.iter().any(|i| i.color().bytes_per_pixel() / i.color().channel_count() > 1);
-    let channels = if gray { 1 } else { 3 };
-    let (w, h) = images.first().map_or((0, 0), |i| (i.width() as usize, i.height() as usize));
-    let shape = vec![images.len(), channels, h, w];
-    if deep {
-        let mut v: Vec<f32> = Vec::new();
-        for image in images {
-            if gray {
-                v.extend(image.to_luma16().as_raw().iter().map(|&s| f32::from(s) / 65535.0));
-            } else {
-                let raw = image.to_rgb16().into_raw();
-                (0..3).for_each(|c| v.extend(raw.iter().skip(c).step_by(3).map(|&s| f32::from(s) / 65535.0)));
-            }
-        }
-        Array::new(shape, Samples::Floats(v), SampleType::F32)
-    } else {
-        let mut v: Vec<u8> = Vec::new();
-        for image in images {
-            if gray {
-                v.extend(image.to_luma8().into_raw());
-            } else {
-                push_planes(&mut v, &image.to_rgb8().into_raw(), 3);
-            }
-        }
-        Array::new(shape, Samples::Bytes(v), SampleType::U8)
-    }
+fn to_video(image: &DynamicImage) -> Result<Array, ReadError> {
+    let color = image.color();
+    let deep = color.bytes_per_pixel() / color.channel_count() > 1;
+    let (w, h) = (image.width() as usize, image.height() as usize);
+    let widened = |raw: Vec<u16>| Samples::Floats(raw.into_iter().map(f32::from).collect());
+    let (channels, samples) = match (color.has_color(), deep) {
+        (false, false) => (1, Samples::Bytes(image.to_luma8().into_raw())),
+        (false, true) => (1, widened(image.to_luma16().into_raw())),
+        (true, false) => (3, Samples::Bytes(planes(&image.to_rgb8().into_raw()))),
+        (true, true) => (3, widened(planes(&image.to_rgb16().into_raw()))),
+    };
+    Array::new(vec![1, channels, h, w], samples, if deep { SampleType::U16 } else { SampleType::U8 })
+}
+
+fn planes<T: Copy>(interleaved: &[T]) -> Vec<T> {
+    let mut planes = Vec::with_capacity(interleaved.len());
+    push_planes(&mut planes, interleaved, 3);
+    planes
 }
 
 /// Appends interleaved pixels of `stride` channels as three planes.
-pub(super) fn push_planes(out: &mut Vec<u8>, interleaved: &[u8], stride: usize) {
+pub(super) fn push_planes<T: Copy>(out: &mut Vec<T>, interleaved: &[T], stride: usize) {
     for c in 0..3 {
-        out.extend(interleaved.iter().skip(c).step_by(stride));
+        out.extend(interleaved.iter().skip(c).step_by(stride).copied());
     }
 }
 
@@ -226,6 +266,25 @@ mod tests {
         let video = read(dir.path()).unwrap();
         assert_eq!(video.shape(), [2, 1, 8, 16]);
         assert_eq!([0, 128].map(|i| video.samples().at(i)), [90.0, 100.0]);
+    }
+
+    #[test]
+    fn pages_of_tiff_files_and_deep_pictures_stand_beside_others() {
+        use ::tiff::encoder::{TiffEncoder, colortype};
+        let dir = tempfile::tempdir().unwrap();
+        let mut pages = TiffEncoder::new(fs::File::create(dir.path().join("f1.tif")).unwrap()).unwrap();
+        for page in [1u16, 2] {
+            pages.write_image::<colortype::Gray16>(4, 3, &[1000 * page; 12]).unwrap();
+        }
+        let video = read(dir.path()).unwrap();
+        assert_eq!((video.shape(), video.stored()), (&[2, 1, 3, 4][..], SampleType::U16));
+        write_png(&dir.path().join("f2.png"), Array3::from_elem((3, 3, 4), 1.0).view()).unwrap();
+        let video = read(dir.path()).unwrap();
+        assert_eq!(video.shape(), [3, 3, 3, 4]);
+        assert_eq!([0, 12, 36, 72, 107].map(|i| video.samples().at(i)), [1000.0, 1000.0, 2000.0, 65535.0, 65535.0]);
+        fs::write(dir.path().join("f3.png"), png(Array3::from_elem((1, 3, 5), 1.0).view()).unwrap()).unwrap();
+        let error = read(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("f3.png") && error.contains("5×3"), "{error}");
     }
 
     #[test]

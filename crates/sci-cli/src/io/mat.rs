@@ -2,26 +2,22 @@
 //!
 //! The v5 container is read here rather than by a crate: it is a flat list of tagged arrays of which a scene needs
 //! four, and the crates at hand either panic on forged type tags or inflate without a bound. Data is inflated straight
-//! from the file's bytes, only for the variables asked for, never beyond the [`Budget`]. v7.3 is HDF5 and goes through
-//! `hdf5-reader`, with its own limits set to the same budget.
+//! from the file's bytes, only for the variables asked for, never beyond the [`Budget`]. v7.3 is [`hdf5`].
 //!
 //! MATLAB is column-major and HDF5 stores its axes reversed, so in both a variable of MATLAB size `[H, W, T]` is a
-//! row-major array of shape `[T, W, H]`, which is the shape given out here.
+//! row-major array of shape `[T, W, H]`, which is the shape given out here. Members of structs are named `struct.member`.
 //!
 //! Source: "MAT-File Format", MathWorks, chapter 1 (level 5 MAT-files).
 
 use std::io::{self, Read, Write};
 
 use flate2::read::ZlibDecoder;
-use hdf5_reader::{Hdf5File, OpenOptions, messages::datatype::Datatype};
 
 use super::samples::{Array, Budget, Endian, SampleType, Samples, element_count};
-use super::{NamedArrays, ReadError};
+use super::{NamedArrays, ReadError, hdf5};
 
 const V5: &str = ".mat (v5)";
-const V73: &str = ".mat (v7.3)";
 const HEADER_LEN: usize = 128;
-const HDF5_SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
 const MI_INT8: u32 = 1;
 const MI_INT32: u32 = 5;
 const MI_UINT32: u32 = 6;
@@ -32,14 +28,14 @@ const MX_SINGLE: u32 = 7;
 /// Longest variable name MATLAB writes is 63 characters; the rest is generosity.
 const MAX_NAME: usize = 4096;
 const MAX_DIMS: usize = 32;
+/// The names of all fields of a struct.
+const MAX_FIELDS: usize = 1 << 20;
+/// Structs in structs.
+const MAX_DEPTH: usize = 8;
 
 /// Whether the bytes open like a MATLAB file of either family.
 pub fn is_mat(bytes: &[u8]) -> bool {
-    is_v73(bytes) || (bytes.len() >= HEADER_LEN && endian_of(bytes).is_some())
-}
-
-fn is_v73(bytes: &[u8]) -> bool {
-    [0, 512].iter().any(|&at| bytes.get(at..at + 8) == Some(HDF5_SIGNATURE))
+    hdf5::is_hdf5(bytes) || (bytes.len() >= HEADER_LEN && endian_of(bytes).is_some())
 }
 
 fn endian_of(bytes: &[u8]) -> Option<Endian> {
@@ -56,8 +52,7 @@ fn endian_of(bytes: &[u8]) -> Option<Endian> {
 /// [`ReadError`] for a file that is none of these, is cut short, or holds a wanted variable that is not a real
 /// numeric array or would not fit the budget.
 pub fn read(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError> {
-    let budget = Budget::for_file(bytes.len());
-    if is_v73(bytes) { read_v73(bytes, wanted, budget) } else { read_v5(bytes, wanted, budget) }
+    if hdf5::is_hdf5(bytes) { hdf5::read(bytes, wanted) } else { read_v5(bytes, wanted, Budget::for_file(bytes.len())) }
 }
 
 fn bad(reason: impl Into<String>) -> ReadError {
@@ -165,6 +160,54 @@ fn take(r: &mut impl Read, size: usize) -> Result<Vec<u8>, ReadError> {
     Ok(bytes)
 }
 
+/// What a variable, or a member of one, begins with.
+struct Head {
+    class: u32,
+    complex: bool,
+    /// Row-major: the reverse of MATLAB's size.
+    shape: Vec<usize>,
+    name: String,
+}
+
+const CELL: u32 = 1;
+const STRUCT: u32 = 2;
+/// From double to uint64.
+const NUMERIC: std::ops::RangeInclusive<u32> = 6..=15;
+
+impl Head {
+    fn read(r: &mut dyn Read, endian: Endian) -> Result<Self, ReadError> {
+        let mut r = r;
+        let (kind, flags) = subelement(&mut r, endian, 8)?;
+        if kind != MI_UINT32 || flags.len() != 8 {
+            return Err(bad("a variable does not begin with its array flags"));
+        }
+        let flags = word(&flags[..4], endian);
+        let (kind, dims) = subelement(&mut r, endian, 4 * MAX_DIMS)?;
+        if kind != MI_INT32 || dims.len() < 8 {
+            return Err(bad("a variable without dimensions"));
+        }
+        let mut shape: Vec<usize> = dims.chunks_exact(4).map(|d| word(d, endian) as usize).collect();
+        shape.reverse();
+        let (kind, name) = subelement(&mut r, endian, MAX_NAME)?;
+        if kind != MI_INT8 {
+            return Err(bad("a variable without a name"));
+        }
+        let name = String::from_utf8_lossy(&name).into_owned();
+        Ok(Self { class: flags & 0xff, complex: flags & 0x0800 != 0, shape, name })
+    }
+
+    /// What it is instead of an array of numbers.
+    fn other(&self) -> &'static str {
+        match self.class {
+            CELL => "a cell array",
+            STRUCT => "a struct",
+            4 => "text",
+            5 => "a sparse matrix",
+            _ => "of an unknown class",
+        }
+    }
+}
+
 fn read_matrix(
     r: &mut impl Read,
     endian: Endian,
@@ -172,56 +215,138 @@ fn read_matrix(
     budget: &mut Budget,
     found: &mut NamedArrays,
 ) -> Result<(), ReadError> {
-    let (kind, flags) = subelement(r, endian, 8)?;
-    if kind != MI_UINT32 || flags.len() != 8 {
-        return Err(bad("a variable does not begin with its array flags"));
-    }
-    let flags = word(&flags[..4], endian);
-    let (kind, dims) = subelement(r, endian, 4 * MAX_DIMS)?;
-    if kind != MI_INT32 || dims.len() < 8 {
-        return Err(bad("a variable without dimensions"));
-    }
-    let mut shape: Vec<usize> = dims.chunks_exact(4).map(|d| word(d, endian) as usize).collect();
-    shape.reverse();
-    let (kind, name) = subelement(r, endian, MAX_NAME)?;
-    if kind != MI_INT8 {
-        return Err(bad("a variable without a name"));
-    }
-    let name = String::from_utf8_lossy(&name).into_owned();
-    found.names.push(name.clone());
-    if !wanted.contains(&name.as_str()) {
-        return Ok(());
-    }
-    let class = flags & 0xff;
-    if !(6..=15).contains(&class) || flags & 0x0800 != 0 {
-        let what = match class {
-            1 => "a cell array",
-            2 | 3 => "a struct",
-            4 => "text",
-            5 => "a sparse matrix",
-            6..=15 => "complex",
-            _ => "of an unknown class",
-        };
-        return Err(ReadError::NotNumeric { key: name, what });
-    }
-    let array = read_numbers(r, endian, &name, shape, budget)?;
-    found.arrays.insert(name, array);
-    Ok(())
+    let head = Head::read(r, endian)?;
+    found.names.push(head.name.clone());
+    let name = head.name.clone();
+    Walk { endian, wanted, budget, found }.visit(r, &head, &name, MAX_DEPTH)
 }
 
-/// The real part: stored in the smallest type that holds its values, whatever the variable's class.
+/// On the way through a variable and its members.
+struct Walk<'a> {
+    endian: Endian,
+    wanted: &'a [&'a str],
+    budget: &'a mut Budget,
+    found: &'a mut NamedArrays,
+}
+
+impl Walk<'_> {
+    /// Takes what is wanted of what follows `head`.
+    fn visit(&mut self, r: &mut dyn Read, head: &Head, name: &str, depth: usize) -> Result<(), ReadError> {
+        if head.class == STRUCT && depth > 0 {
+            self.members(r, head, name, depth)?;
+        }
+        if !self.wanted.contains(&name) {
+            return Ok(());
+        }
+        let array = match head.class {
+            class if NUMERIC.contains(&class) => read_numbers(r, self.endian, name, head, self.budget)?,
+            CELL => self.cells(r, head, name)?,
+            _ => return Err(ReadError::NotNumeric { key: name.to_owned(), what: head.other() }),
+        };
+        self.found.arrays.insert(name.to_owned(), array);
+        Ok(())
+    }
+
+    /// The members of a struct are listed; they are gone through only if one of them is wanted.
+    fn members(&mut self, r: &mut dyn Read, head: &Head, name: &str, depth: usize) -> Result<(), ReadError> {
+        let mut r = r;
+        let (_, length) = subelement(&mut r, self.endian, 8)?;
+        let length = length.get(..4).map_or(0, |b| word(b, self.endian) as usize);
+        let (_, fields) = subelement(&mut r, self.endian, MAX_FIELDS)?;
+        if length == 0 || length > MAX_NAME {
+            return Err(bad(format!("`{name}`: field names of {length} characters")));
+        }
+        let text =
+            |field: &[u8]| String::from_utf8_lossy(field.split(|&b| b == 0).next().unwrap_or_default()).into_owned();
+        let fields: Vec<String> = fields.chunks_exact(length).map(|f| format!("{name}.{}", text(f))).collect();
+        self.found.names.extend(fields.iter().cloned());
+        let inner = format!("{name}.");
+        if !self.wanted.iter().any(|w| w.starts_with(&inner)) {
+            return Ok(());
+        }
+        if element_count(&head.shape) != Some(1) {
+            return Err(ReadError::NotNumeric { key: name.to_owned(), what: "an array of structs" });
+        }
+        for field in fields {
+            let Some((head, mut member)) = member(r, self.endian)? else { continue };
+            self.visit(&mut member, &head, &field, depth - 1)?;
+            // What was not wanted is passed over.
+            io::copy(&mut member, &mut io::sink()).map_err(|e| cut_short(&e))?;
+        }
+        Ok(())
+    }
+
+    /// The elements of a cell array, all of one size: MATLAB's `[H, W]` of N cells becomes `[N, W, H]`.
+    fn cells(&mut self, r: &mut dyn Read, head: &Head, name: &str) -> Result<Array, ReadError> {
+        let not_frames =
+            || ReadError::NotNumeric { key: name.to_owned(), what: "a cell array of what is not arrays of numbers" };
+        let count = element_count(&head.shape).unwrap_or(usize::MAX);
+        // Each takes more than this in the file, so no one can claim more than there are.
+        self.budget.claim(count, size_of::<u64>())?;
+        let frames = (0..count).map(|_| {
+            let (head, mut cell) = member(&mut *r, self.endian)?.ok_or_else(not_frames)?;
+            if !NUMERIC.contains(&head.class) {
+                return Err(not_frames());
+            }
+            let frame = read_numbers(&mut cell, self.endian, name, &head, self.budget)?;
+            io::copy(&mut cell, &mut io::sink()).map_err(|e| cut_short(&e))?;
+            Ok(frame)
+        });
+        Array::stacked(name, frames)
+    }
+}
+
+/// A member of a struct or a cell: its head, and a reader of the rest of it.
+type Member<'r> = (Head, io::Take<&'r mut dyn Read>);
+
+/// The next member, `None` if it is empty.
+fn member(r: &mut dyn Read, endian: Endian) -> Result<Option<Member<'_>>, ReadError> {
+    let mut r = r;
+    let (kind, size) = tag(&mut r, endian)?;
+    if kind != MI_MATRIX {
+        return Err(bad(format!("a member of element type {kind}, expected {MI_MATRIX}")));
+    }
+    if size == 0 {
+        return Ok(None);
+    }
+    let mut member = r.take(size as u64);
+    Ok(Some((Head::read(&mut member, endian)?, member)))
+}
+
+/// The numbers: stored in the smallest type that holds them, whatever the variable's class.
 fn read_numbers(
-    r: &mut impl Read,
+    r: &mut dyn Read,
     endian: Endian,
     name: &str,
-    shape: Vec<usize>,
+    head: &Head,
     budget: &mut Budget,
 ) -> Result<Array, ReadError> {
+    let mut r = r;
+    let shape = head.shape.clone();
     let too_many = || bad(format!("`{name}` claims a size of {shape:?} samples"));
     let count = element_count(&shape).ok_or_else(too_many)?;
-    let raw_limit = budget.left();
-    let (kind, raw) = subelement(r, endian, raw_limit)?;
-    let stored = match kind {
+    let (packed, raw) = subelement(&mut r, endian, budget.left())?;
+    let packed = sample_type(packed).ok_or_else(|| bad(format!("`{name}` holds samples of unknown type {packed}")))?;
+    if Some(raw.len()) != count.checked_mul(packed.size()) {
+        return Err(shape_mismatch(name, &shape, raw.len() / packed.size()));
+    }
+    budget.claim(count, packed.decoded_size())?;
+    if head.complex {
+        let (kind, imaginary) = subelement(&mut r, endian, budget.left())?;
+        let kind = sample_type(kind).ok_or_else(|| bad(format!("`{name}` holds samples of unknown type {kind}")))?;
+        let imaginary = Samples::decode(imaginary, kind, endian);
+        if (0..imaginary.len()).any(|i| imaginary.at(i) != 0.0) {
+            return Err(ReadError::NotNumeric {
+                key: name.to_owned(),
+                what: "complex, with imaginary parts that are not zero",
+            });
+        }
+    }
+    Array::new(shape, Samples::decode(raw, packed, endian), class_type(head.class).unwrap_or(packed))
+}
+
+fn sample_type(element: u32) -> Option<SampleType> {
+    Some(match element {
         1 => SampleType::I8,
         2 => SampleType::U8,
         3 => SampleType::I16,
@@ -232,78 +357,30 @@ fn read_numbers(
         9 => SampleType::F64,
         12 => SampleType::I64,
         13 => SampleType::U64,
-        _ => return Err(bad(format!("`{name}` holds samples of unknown type {kind}"))),
-    };
-    if Some(raw.len()) != count.checked_mul(stored.size()) {
-        return Err(shape_mismatch(name, &shape, raw.len() / stored.size()));
-    }
-    budget.claim(count, stored.decoded_size())?;
-    Array::new(shape, Samples::decode(raw, stored, endian), stored)
+        _ => return None,
+    })
+}
+
+/// What a variable of a class holds for MATLAB.
+fn class_type(class: u32) -> Option<SampleType> {
+    Some(match class {
+        6 => SampleType::F64,
+        7 => SampleType::F32,
+        8 => SampleType::I8,
+        9 => SampleType::U8,
+        10 => SampleType::I16,
+        11 => SampleType::U16,
+        12 => SampleType::I32,
+        13 => SampleType::U32,
+        14 => SampleType::I64,
+        15 => SampleType::U64,
+        _ => return None,
+    })
 }
 
 fn shape_mismatch(name: &str, shape: &[usize], got: usize) -> ReadError {
     let matlab: Vec<_> = shape.iter().rev().collect();
     bad(format!("`{name}` has size {matlab:?} but {got} samples"))
-}
-
-fn read_v73(bytes: &[u8], wanted: &[&str], mut budget: Budget) -> Result<NamedArrays, ReadError> {
-    let hdf = |e: hdf5_reader::error::Error| ReadError::Malformed { format: V73, reason: e.to_string() };
-    let limit = budget.left();
-    let options = OpenOptions::default()
-        .with_max_read_bytes(limit)
-        .with_max_chunk_bytes(limit)
-        // Every dataset is read once, so nothing is worth keeping.
-        .with_chunk_cache_bytes(0)
-        .with_max_object_header_bytes(1 << 20);
-    let file = Hdf5File::from_bytes_with_options(bytes, options).map_err(hdf)?;
-    let root = file.root_group().map_err(hdf)?;
-    let (_, names) = root.member_names().map_err(hdf)?;
-    let mut found = NamedArrays::default();
-    for name in names {
-        found.names.push(name.clone());
-        if !wanted.contains(&name.as_str()) {
-            continue;
-        }
-        let data = root.dataset(&name).map_err(hdf)?;
-        let shape: Vec<usize> = data.shape().iter().map(|&d| usize::try_from(d).unwrap_or(usize::MAX)).collect();
-        let count = element_count(&shape).unwrap_or(usize::MAX);
-        let (stored, samples) = read_dataset(&data, &name, count, &mut budget, &hdf)?;
-        found.arrays.insert(name, Array::new(shape, samples, stored)?);
-    }
-    Ok(found)
-}
-
-fn read_dataset(
-    data: &hdf5_reader::Dataset,
-    name: &str,
-    count: usize,
-    budget: &mut Budget,
-    hdf: &impl Fn(hdf5_reader::error::Error) -> ReadError,
-) -> Result<(SampleType, Samples), ReadError> {
-    macro_rules! floats {
-        ($kind:ident, $t:ty) => {{
-            budget.claim(count, size_of::<$t>().max(4))?;
-            let values = data.read_array::<$t>().map_err(hdf)?;
-            (SampleType::$kind, Samples::Floats(values.iter().map(|&v| v as f32).collect()))
-        }};
-    }
-    Ok(match data.dtype() {
-        Datatype::FixedPoint { size: 1, signed: false, .. } => {
-            budget.claim(count, 1)?;
-            let values = data.read_array::<u8>().map_err(hdf)?;
-            (SampleType::U8, Samples::Bytes(values.into_iter().collect()))
-        }
-        Datatype::FixedPoint { size: 1, signed: true, .. } => floats!(I8, i8),
-        Datatype::FixedPoint { size: 2, signed: true, .. } => floats!(I16, i16),
-        Datatype::FixedPoint { size: 2, signed: false, .. } => floats!(U16, u16),
-        Datatype::FixedPoint { size: 4, signed: true, .. } => floats!(I32, i32),
-        Datatype::FixedPoint { size: 4, signed: false, .. } => floats!(U32, u32),
-        Datatype::FixedPoint { size: 8, signed: true, .. } => floats!(I64, i64),
-        Datatype::FixedPoint { size: 8, signed: false, .. } => floats!(U64, u64),
-        Datatype::FloatingPoint { size: 4, .. } => floats!(F32, f32),
-        Datatype::FloatingPoint { size: 8, .. } => floats!(F64, f64),
-        _ => return Err(ReadError::NotNumeric { key: name.to_owned(), what: "not a real numeric array" }),
-    })
 }
 
 /// One variable to write: its name, its MATLAB size and its samples in column-major order.
@@ -473,23 +550,82 @@ mod tests {
         assert!(error.to_string().contains("at most"), "{error}");
     }
 
+    /// An element with its padding.
+    fn element(kind: u32, data: &[u8]) -> Vec<u8> {
+        [&kind.to_le_bytes(), &(data.len() as u32).to_le_bytes(), data, padding(data.len())].concat()
+    }
+
+    /// A variable of a class, with what follows its name.
+    fn matrix(flags: u32, size: [u32; 2], name: &str, content: &[Vec<u8>]) -> Vec<u8> {
+        let size = size.iter().flat_map(|n| n.to_le_bytes()).collect::<Vec<_>>();
+        let head = [
+            element(MI_UINT32, &[flags.to_le_bytes(), [0; 4]].concat()),
+            element(MI_INT32, &size),
+            element(MI_INT8, name.as_bytes()),
+        ];
+        element(MI_MATRIX, &[head.concat(), content.concat()].concat())
+    }
+
+    fn doubles(values: &[f64]) -> Vec<u8> {
+        element(9, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())
+    }
+
+    /// A struct `data` with members `mask` and `more.meas`, a cell array of frames, one of unequal ones, and complex numbers.
+    fn nested() -> Vec<u8> {
+        let fields = |names: &[&str]| {
+            let padded: Vec<u8> = names.iter().flat_map(|n| format!("{n:\0<8}").into_bytes()).collect();
+            [element(MI_INT32, &8u32.to_le_bytes()), element(MI_INT8, &padded)].concat()
+        };
+        let frame = |v: f64| matrix(6, [2, 1], "", &[doubles(&[v, v + 1.0])]);
+        let inner = matrix(STRUCT, [1, 1], "", &[fields(&["meas"]), frame(5.0)]);
+        let bytes = file(&[]);
+        [
+            bytes,
+            matrix(
+                STRUCT,
+                [1, 1],
+                "data",
+                &[fields(&["note", "mask", "more"]), element(MI_MATRIX, &[]), frame(1.0), inner],
+            ),
+            matrix(CELL, [1, 2], "frames", &[frame(1.0), frame(3.0)]),
+            matrix(CELL, [1, 2], "uneven", &[frame(1.0), matrix(6, [1, 1], "", &[doubles(&[3.0])])]),
+            matrix(6 | 0x0800, [2, 1], "real", &[doubles(&[7.0, 8.0]), doubles(&[0.0, -0.0])]),
+            matrix(6 | 0x0800, [2, 1], "wave", &[doubles(&[7.0, 8.0]), doubles(&[0.0, 1.0])]),
+        ]
+        .concat()
+    }
+
     #[test]
-    fn v73_with_userblock() {
-        let mut b = hdf5_pure::FileBuilder::new();
-        b.create_dataset("mask").with_u8_data(&[0, 1, 1, 0, 1, 0]).with_shape(&[1, 2, 3]);
-        b.create_dataset("meas").with_f64_data(&[0.5; 6]).with_shape(&[1, 2, 3]);
-        let plain = b.finish().unwrap();
-        let found = read(&plain, &["mask", "meas"]).unwrap();
-        assert_eq!(found.arrays["mask"].shape(), [1, 2, 3]);
-        assert_eq!(found.arrays["mask"].samples(), &Samples::Bytes(vec![0, 1, 1, 0, 1, 0]));
-        assert_eq!(found.arrays["meas"].samples().at(3), 0.5);
-        for len in (0..plain.len()).step_by(7) {
-            let _ = read(&plain[..len], &["mask", "meas"]);
+    fn members_of_structs_cells_of_frames_and_real_complex_numbers() {
+        for bytes in [nested(), compressed(&nested())] {
+            let found = read(&bytes, &["data.mask", "data.more.meas", "frames", "real"]).unwrap();
+            let names =
+                ["data", "data.note", "data.mask", "data.more", "data.more.meas", "frames", "uneven", "real", "wave"];
+            assert_eq!(found.names, names);
+            let values = |key: &str| found.arrays[key].samples().clone();
+            assert_eq!(values("data.mask"), Samples::Floats(vec![1.0, 2.0]));
+            assert_eq!(values("data.more.meas"), Samples::Floats(vec![5.0, 6.0]));
+            assert_eq!(found.arrays["frames"].shape(), [2, 1, 2]);
+            assert_eq!(values("frames"), Samples::Floats(vec![1.0, 2.0, 3.0, 4.0]));
+            assert_eq!(values("real"), Samples::Floats(vec![7.0, 8.0]));
+            for (name, part) in [("uneven", "of one size"), ("wave", "imaginary parts"), ("data", "a struct")] {
+                let error = read(&bytes, &[name]).unwrap_err().to_string();
+                assert!(error.contains(part) && error.contains(name), "{error}");
+            }
         }
-        for at in 0..plain.len() {
-            let mut bytes = plain.clone();
-            bytes[at] ^= 0xff;
-            let _ = read(&bytes, &["mask", "meas"]);
+    }
+
+    #[test]
+    fn damaged_structs_and_cells_never_panic() {
+        let wanted = ["data.mask", "data.more.meas", "frames", "uneven", "real", "wave"];
+        let bytes = nested();
+        for at in 0..bytes.len() {
+            let _ = read(&bytes[..at], &wanted);
+            for value in [0, 1, 0x7f, 0x80, 0xff] {
+                let mut b = bytes.clone();
+                b[at] = value;
+                let _ = read(&b, &wanted);
+            }
         }
     }
 }

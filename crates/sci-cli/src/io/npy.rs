@@ -43,7 +43,7 @@ pub fn read_npy(bytes: &[u8]) -> Result<Array, ReadError> {
 
 fn read_npy_within(bytes: &[u8], budget: &mut Budget) -> Result<Array, ReadError> {
     let (header, data) = split_header(bytes)?;
-    let (stored, endian) = sample_type(quoted(header, "descr")?)?;
+    let (stored, endian, parts) = sample_type(quoted(header, "descr")?)?;
     let fortran = match after(header, "fortran_order")? {
         s if s.starts_with("True") => true,
         s if s.starts_with("False") => false,
@@ -51,16 +51,21 @@ fn read_npy_within(bytes: &[u8], budget: &mut Budget) -> Result<Array, ReadError
     };
     let shape = shape(header)?;
     let count = element_count(&shape).ok_or_else(|| bad(format!("shape {shape:?} overflows")))?;
-    let needed = count.checked_mul(stored.size()).filter(|&n| n <= data.len());
+    let needed = count.checked_mul(parts * stored.size()).filter(|&n| n <= data.len());
     let Some(needed) = needed else {
         return Err(bad(format!(
             "cut short: shape {shape:?} of {}-byte samples, but {} bytes of data",
-            stored.size(),
+            parts * stored.size(),
             data.len()
         )));
     };
-    budget.claim(count, stored.decoded_size())?;
+    // Complex numbers are there in whole before their real parts are taken out.
+    budget.claim(count, (2 * parts - 1) * stored.decoded_size())?;
     let samples = Samples::decode(data[..needed].to_vec(), stored, endian);
+    let samples = match parts {
+        1 => samples,
+        _ => samples.real_parts().ok_or_else(|| bad("complex numbers whose imaginary parts are not all zero"))?,
+    };
     let samples = if fortran { to_row_major(&samples, &shape) } else { samples };
     Array::new(shape, samples, stored)
 }
@@ -117,9 +122,13 @@ fn shape(header: &str) -> Result<Vec<usize>, ReadError> {
         .collect()
 }
 
-fn sample_type(descr: &str) -> Result<(SampleType, Endian), ReadError> {
-    let unsupported =
-        || bad(format!("samples of type {descr:?}; supported are bool, integers and 4- or 8-byte floats"));
+/// The type of a sample, its byte order, and how many make a number: two for complex ones.
+fn sample_type(descr: &str) -> Result<(SampleType, Endian, usize), ReadError> {
+    let unsupported = || {
+        bad(format!(
+            "samples of type {descr:?}; supported are bool, integers, 2-, 4- or 8-byte floats and complex numbers of them"
+        ))
+    };
     let (endian, code) = match descr.split_at_checked(1) {
         Some(("<" | "|" | "=", code)) => (Endian::Little, code),
         Some((">", code)) => (Endian::Big, code),
@@ -134,11 +143,12 @@ fn sample_type(descr: &str) -> Result<(SampleType, Endian), ReadError> {
         "u4" => SampleType::U32,
         "i8" => SampleType::I64,
         "u8" => SampleType::U64,
-        "f4" => SampleType::F32,
-        "f8" => SampleType::F64,
+        "f2" => SampleType::F16,
+        "f4" | "c8" => SampleType::F32,
+        "f8" | "c16" => SampleType::F64,
         _ => return Err(unsupported()),
     };
-    Ok((stored, endian))
+    Ok((stored, endian, if code.starts_with('c') { 2 } else { 1 }))
 }
 
 fn to_row_major(samples: &Samples, shape: &[usize]) -> Samples {
@@ -256,6 +266,22 @@ mod tests {
             let expected: Vec<f32> = ramp().iter().copied().collect();
             assert_eq!(read.samples(), &Samples::Floats(expected));
         }
+    }
+
+    fn file(descr: &str, count: usize, data: &[u8]) -> Vec<u8> {
+        let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({count},), }}");
+        [MAGIC, &[1, 0, 118, 0], format!("{header:117}\n").as_bytes(), data].concat()
+    }
+
+    #[test]
+    fn half_floats_and_complex_without_imaginary_part_are_read() {
+        let halves = read_npy(&file("<f2", 2, &[0x00, 0x38, 0x00, 0xc0])).unwrap();
+        assert_eq!((halves.samples(), halves.stored()), (&Samples::Floats(vec![0.5, -2.0]), SampleType::F16));
+        let pairs: Vec<u8> = [1.5f64, 0.0, 2.5, 0.0].iter().flat_map(|x| x.to_le_bytes()).collect();
+        assert_eq!(read_npy(&file("<c16", 2, &pairs)).unwrap().samples(), &Samples::Floats(vec![1.5, 2.5]));
+        let pairs: Vec<u8> = [1.5f32, 0.5].iter().flat_map(|x| x.to_le_bytes()).collect();
+        let error = read_npy(&file("<c8", 1, &pairs)).unwrap_err().to_string();
+        assert!(error.contains("imaginary"), "{error}");
     }
 
     #[test]

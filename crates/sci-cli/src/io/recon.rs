@@ -290,7 +290,8 @@ mod tests {
                 let to = dir.path().join(format.file_name());
                 let parts = Parts { paths: &paths, shape: [2, channels, 3, 4], unit: 0.5 };
                 join(&to, format, &parts).unwrap();
-                let found = scene::read_video(&to, &Reading { keys: keys.clone(), ..Default::default() }).unwrap();
+                let found =
+                    scene::read_video(&to, &Reading { keys: keys.clone(), ..Default::default() }).unwrap().frames;
                 let worst = (found - &expected * 0.5).fold(0f32, |worst, d| worst.max(d.abs()));
                 assert!(worst < 1e-6, "{format:?}, {channels} channels: {worst}");
             }

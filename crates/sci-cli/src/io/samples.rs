@@ -3,6 +3,8 @@
 //! Files hold a dozen number types; the solvers want `f32`. Eight-bit samples stay eight-bit until a scene is
 //! assembled, so that a long video costs a byte a sample, and everything else is converted while it is decoded.
 
+use half::f16;
+
 use super::ReadError;
 
 /// Bytes a reader may allocate on top of four times the file's own size.
@@ -64,6 +66,7 @@ pub enum SampleType {
     U32,
     I64,
     U64,
+    F16,
     F32,
     F64,
 }
@@ -73,15 +76,15 @@ impl SampleType {
     pub fn size(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
+            Self::I16 | Self::U16 | Self::F16 => 2,
             Self::I32 | Self::U32 | Self::F32 => 4,
             Self::I64 | Self::U64 | Self::F64 => 8,
         }
     }
 
-    /// Whether the samples are whole numbers, which by convention run from 0 to 255.
+    /// Whether the samples are whole numbers.
     pub fn is_integer(self) -> bool {
-        !matches!(self, Self::F32 | Self::F64)
+        !matches!(self, Self::F16 | Self::F32 | Self::F64)
     }
 
     /// Bytes one sample takes once decoded.
@@ -97,6 +100,29 @@ pub enum Endian {
     Little,
     /// Most significant byte first.
     Big,
+}
+
+/// A number as `f32`, rounded to the nearest one.
+trait Narrowed {
+    fn narrowed(self) -> f32;
+}
+
+macro_rules! narrowed {
+    ($($t:ty)*) => {$(
+        impl Narrowed for $t {
+            fn narrowed(self) -> f32 {
+                self as f32
+            }
+        }
+    )*};
+}
+
+narrowed!(i8 i16 u16 i32 u32 i64 u64 f32 f64);
+
+impl Narrowed for f16 {
+    fn narrowed(self) -> f32 {
+        self.to_f32()
+    }
 }
 
 /// Decoded samples.
@@ -133,6 +159,48 @@ impl Samples {
         }
     }
 
+    /// Makes room for more.
+    pub fn reserve_exact(&mut self, more: usize) {
+        match self {
+            Self::Bytes(v) => v.reserve_exact(more),
+            Self::Floats(v) => v.reserve_exact(more),
+        }
+    }
+
+    /// Planes of `size` samples in another order.
+    ///
+    /// # Panics
+    /// If there is no such plane.
+    #[must_use]
+    pub fn in_order(&self, planes: &[usize], size: usize) -> Self {
+        fn pick<T: Copy>(v: &[T], planes: &[usize], size: usize) -> Vec<T> {
+            planes.iter().flat_map(|&p| &v[p * size..(p + 1) * size]).copied().collect()
+        }
+        match self {
+            Self::Bytes(v) => Self::Bytes(pick(v, planes, size)),
+            Self::Floats(v) => Self::Floats(pick(v, planes, size)),
+        }
+    }
+
+    /// Appends samples that were stored as the same type.
+    pub fn append(&mut self, more: Self) {
+        match (self, more) {
+            (Self::Bytes(all), Self::Bytes(more)) => all.extend(more),
+            (Self::Floats(all), Self::Floats(more)) => all.extend(more),
+            (all, more) => {
+                let floats = |s: &Self| (0..s.len()).map(|i| s.at(i)).collect::<Vec<f32>>();
+                *all = Self::Floats([floats(all), floats(&more)].concat());
+            }
+        }
+    }
+
+    /// The real parts of complex numbers, if all imaginary parts are zero; real and imaginary part take turns.
+    pub fn real_parts(&self) -> Option<Self> {
+        let Self::Floats(pairs) = self else { return None };
+        let (pairs, _) = pairs.as_chunks();
+        pairs.iter().all(|&[_, imaginary]| imaginary == 0.0).then(|| Self::Floats(pairs.iter().map(|p| p[0]).collect()))
+    }
+
     /// Decodes raw bytes; a trailing partial sample is ignored.
     pub fn decode(raw: Vec<u8>, kind: SampleType, endian: Endian) -> Self {
         macro_rules! floats {
@@ -141,10 +209,11 @@ impl Samples {
                     raw.chunks_exact(size_of::<$t>())
                         .map(|b| {
                             let b = b.try_into().expect("chunks_exact yields this length");
-                            (match endian {
+                            let value = match endian {
                                 Endian::Little => <$t>::from_le_bytes(b),
                                 Endian::Big => <$t>::from_be_bytes(b),
-                            }) as f32
+                            };
+                            value.narrowed()
                         })
                         .collect(),
                 )
@@ -159,6 +228,7 @@ impl Samples {
             SampleType::U32 => floats!(u32),
             SampleType::I64 => floats!(i64),
             SampleType::U64 => floats!(u64),
+            SampleType::F16 => floats!(f16),
             SampleType::F32 => floats!(f32),
             SampleType::F64 => floats!(f64),
         }
@@ -178,6 +248,7 @@ pub struct Array {
     shape: Vec<usize>,
     samples: Samples,
     stored: SampleType,
+    white: Option<f32>,
 }
 
 impl Array {
@@ -187,12 +258,60 @@ impl Array {
     /// [`ReadError::Malformed`] if the shape does not hold that many samples.
     pub fn new(shape: Vec<usize>, samples: Samples, stored: SampleType) -> Result<Self, ReadError> {
         match element_count(&shape) {
-            Some(n) if n == samples.len() => Ok(Self { shape, samples, stored }),
+            Some(n) if n == samples.len() => Ok(Self { shape, samples, stored, white: None }),
             _ => Err(ReadError::Malformed {
                 format: "array",
                 reason: format!("shape {shape:?} does not hold {} samples", samples.len()),
             }),
         }
+    }
+
+    /// The arrays of a cell array, all of one size, one after the other along a new first axis.
+    ///
+    /// # Errors
+    /// The first one of `arrays`; [`ReadError::NotNumeric`] if there is none or they differ.
+    pub fn stacked(
+        key: &str,
+        arrays: impl ExactSizeIterator<Item = Result<Self, ReadError>>,
+    ) -> Result<Self, ReadError> {
+        let unequal = || ReadError::NotNumeric {
+            key: key.to_owned(),
+            what: "a cell array of arrays that are not all of one size",
+        };
+        let count = arrays.len();
+        let mut all: Option<Self> = None;
+        for array in arrays {
+            let array = array?;
+            match &mut all {
+                None => all = Some(array),
+                Some(all) if all.shape == array.shape && all.stored == array.stored => {
+                    all.samples.append(array.samples)
+                }
+                Some(_) => return Err(unequal()),
+            }
+        }
+        let all = all.ok_or_else(unequal)?;
+        let shape = [&[count], all.shape.as_slice()].concat();
+        Self::new(shape, all.samples, all.stored)
+    }
+
+    /// Says what white is stored as, where the file tells.
+    #[must_use]
+    pub fn with_white(self, white: f32) -> Self {
+        Self { white: Some(white), ..self }
+    }
+
+    /// What white is stored as, if the file tells.
+    pub fn white(&self) -> Option<f32> {
+        self.white
+    }
+
+    /// The same samples in another shape.
+    ///
+    /// # Errors
+    /// [`ReadError::Malformed`] if that shape does not hold as many.
+    pub fn reshaped(self, shape: Vec<usize>) -> Result<Self, ReadError> {
+        Ok(Self { white: self.white, ..Self::new(shape, self.samples, self.stored)? })
     }
 
     /// Row-major shape.
@@ -203,6 +322,11 @@ impl Array {
     /// The samples, row-major.
     pub fn samples(&self) -> &Samples {
         &self.samples
+    }
+
+    /// The samples alone.
+    pub fn into_samples(self) -> Samples {
+        self.samples
     }
 
     /// The number type in the file.
@@ -235,6 +359,15 @@ mod tests {
             Samples::Floats(vec![-2.5])
         );
         assert_eq!(Samples::decode(vec![255], SampleType::I8, Endian::Little), Samples::Floats(vec![-1.0]));
+    }
+
+    #[test]
+    fn halves_and_complex_numbers_without_imaginary_part_become_reals() {
+        let halves = [f16::from_f32(0.5), f16::from_f32(-2.0)].iter().flat_map(|h| h.to_le_bytes()).collect();
+        let halves = Samples::decode(halves, SampleType::F16, Endian::Little);
+        assert_eq!(halves, Samples::Floats(vec![0.5, -2.0]));
+        assert_eq!(halves.real_parts(), None);
+        assert_eq!(Samples::Floats(vec![3.0, 0.0, 4.0, 0.0]).real_parts(), Some(Samples::Floats(vec![3.0, 4.0])));
     }
 
     #[test]

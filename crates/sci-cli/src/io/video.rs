@@ -1,7 +1,7 @@
 //! Owns video files: animated GIF (read and write) and Y4M (read).
 
 use std::fs;
-use std::io::{self, Cursor, Write};
+use std::io::{self, Cursor, Read, Write};
 use std::path::PathBuf;
 
 use image::{AnimationDecoder, ImageDecoder, Limits, codecs::gif::GifDecoder};
@@ -67,7 +67,7 @@ pub fn read_gif(bytes: &[u8]) -> Result<Array, ReadError> {
 }
 
 /// Keeps one channel of a video `[T, 3, H, W]` whose channels are all equal.
-fn drop_equal_channels(mut planes: Vec<u8>, t: usize, h: usize, w: usize) -> Result<Array, ReadError> {
+pub(super) fn drop_equal_channels(mut planes: Vec<u8>, t: usize, h: usize, w: usize) -> Result<Array, ReadError> {
     let n = h * w;
     let gray = n > 0 && planes.chunks_exact(3 * n).all(|f| f[..n] == f[n..2 * n] && f[..n] == f[2 * n..]);
     if gray {
@@ -79,35 +79,38 @@ fn drop_equal_channels(mut planes: Vec<u8>, t: usize, h: usize, w: usize) -> Res
     }
 }
 
-/// Reads a Y4M stream, 8 bits a sample, as `[T, C, H, W]`, 0 to 255: C = 1 for `mono`, else RGB.
+/// Reads a Y4M stream of 8 to 16 bits a sample as `[T, C, H, W]`, from 0 to full scale: C = 1 for `mono`, else RGB.
 ///
-/// YCbCr is taken as BT.601, limited range (16 to 235) unless the header says `XCOLORRANGE=FULL`; chroma of a
+/// YCbCr is taken as BT.601, limited range (16 to 235 of 255) unless the header says `XCOLORRANGE=FULL`; chroma of a
 /// subsampled stream is repeated.
 ///
 /// # Errors
-/// [`ReadError`] for broken bytes, more than 8 bits a sample, or more pixels than the file's budget.
+/// [`ReadError`] for broken bytes, or more pixels than the file's budget.
 pub fn read_y4m(bytes: &[u8]) -> Result<Array, ReadError> {
     let bad = |reason: String| ReadError::Malformed { format: Y4M, reason };
-    let full_range = check_y4m_header(bytes)?;
+    let header = Y4mHeader::read(bytes)?;
     let mut budget = Budget::for_file(bytes.len());
     let limits = y4m::Limits { bytes: budget.left() };
-    let mut reader = Cursor::new(bytes);
+    let mut reader = Cursor::new(header.known.as_bytes()).chain(header.frames);
     let mut decoder = y4m::Decoder::new_with_limits(&mut reader, limits).map_err(|e| bad(e.to_string()))?;
-    if decoder.get_bytes_per_sample() != 1 {
-        return Err(bad(format!("{} bits a sample, only 8 are supported", decoder.get_bit_depth())));
-    }
     let (w, h) = (decoder.get_width(), decoder.get_height());
     let space = decoder.get_colorspace();
-    budget.claim(w * h, 3)?;
-    let channels = if matches!(space, y4m::Colorspace::Cmono) { 1 } else { 3 };
-    let mut planes = Vec::new();
+    let deep = decoder.get_bytes_per_sample() == 2;
+    budget.claim(w * h, if deep { 6 } else { 3 })?;
+    let channels = if matches!(space, y4m::Colorspace::Cmono | y4m::Colorspace::Cmono12) { 1 } else { 3 };
+    let convert = Ycc { space, size: (w, h), bits: header.bits, full_range: header.full_range };
+    let (mut planes, mut deep_planes) = (Vec::new(), Vec::new());
     let mut frames = 0;
     loop {
         match decoder.read_frame() {
             Ok(frame) => {
-                budget.claim(w * h, channels)?;
+                budget.claim(w * h * channels, if deep { 4 } else { 1 })?;
                 let ycc = [frame.get_y_plane(), frame.get_u_plane(), frame.get_v_plane()];
-                push_ycc(&mut planes, ycc, space, (w, h), full_range);
+                if deep {
+                    convert.each(ycc, |x| deep_planes.push(x));
+                } else {
+                    convert.each(ycc, |x| planes.push(x as u8));
+                }
                 frames += 1;
             }
             Err(y4m::Error::EOF) => break,
@@ -117,46 +120,113 @@ pub fn read_y4m(bytes: &[u8]) -> Result<Array, ReadError> {
     if frames == 0 {
         return Err(bad("no frames".into()));
     }
-    Array::new(vec![frames, channels, h, w], Samples::Bytes(planes), SampleType::U8)
-}
-
-/// Checks the sizes in the header line, which the decoder multiplies unchecked; says whether samples use all of 0 to 255.
-fn check_y4m_header(bytes: &[u8]) -> Result<bool, ReadError> {
-    let line = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
-    let line = String::from_utf8_lossy(line);
-    let side = |field: &str| field.strip_prefix('W').or_else(|| field.strip_prefix('H')).map(str::parse::<usize>);
-    for field in line.split_ascii_whitespace().skip(1) {
-        if side(field).is_some_and(|n| !n.is_ok_and(|n| (1..=MAX_SIDE).contains(&n))) {
-            return Err(ReadError::Malformed {
-                format: Y4M,
-                reason: format!("header field {field:?}: a side is 1 to {MAX_SIDE} pixels"),
-            });
-        }
+    let shape = vec![frames, channels, h, w];
+    if deep {
+        Ok(Array::new(shape, Samples::Floats(deep_planes), SampleType::U16)?.with_white(convert.white()))
+    } else {
+        Array::new(shape, Samples::Bytes(planes), SampleType::U8)
     }
-    Ok(line.contains("XCOLORRANGE=FULL"))
 }
 
-fn push_ycc(out: &mut Vec<u8>, [y, u, v]: [&[u8]; 3], space: y4m::Colorspace, (w, h): (usize, usize), full: bool) {
-    use y4m::Colorspace as C;
-    let (y_scale, y_zero, c_scale) = if full { (1.0, 0.0, 1.0) } else { (255.0 / 219.0, 16.0, 255.0 / 224.0) };
-    let luma = |i: usize| (f32::from(y[i]) - y_zero) * y_scale;
-    let byte = |x: f32| x.round().clamp(0.0, 255.0) as u8;
-    let (sx, sy) = match space {
-        C::Cmono | C::Cmono12 => {
-            out.extend((0..w * h).map(|i| byte(luma(i))));
-            return;
+/// The header line, read before the decoder does: that multiplies sizes unchecked, and knows few of the depths that exist.
+struct Y4mHeader<'a> {
+    /// The line, with a depth of more than 8 bits called 12, which is stored the same way.
+    known: String,
+    /// What follows it.
+    frames: &'a [u8],
+    bits: u32,
+    /// Whether samples use all of 0 to full scale.
+    full_range: bool,
+}
+
+impl<'a> Y4mHeader<'a> {
+    fn read(bytes: &'a [u8]) -> Result<Self, ReadError> {
+        let bad = |field: &str, rule: String| ReadError::Malformed {
+            format: Y4M,
+            reason: format!("header field {field:?}: {rule}"),
+        };
+        let end = bytes
+            .iter()
+            .take(MAX_Y4M_HEADER)
+            .position(|&b| b == b'\n')
+            .map_or(bytes.len().min(MAX_Y4M_HEADER), |at| at + 1);
+        let (line, frames) = bytes.split_at(end);
+        let line = String::from_utf8_lossy(line);
+        let side = |field: &str| field.strip_prefix('W').or_else(|| field.strip_prefix('H')).map(str::parse::<usize>);
+        let (mut known, mut bits) = (line.to_string(), 8);
+        for field in line.split_ascii_whitespace().skip(1) {
+            if side(field).is_some_and(|n| !n.is_ok_and(|n| (1..=MAX_SIDE).contains(&n))) {
+                return Err(bad(field, format!("a side is 1 to {MAX_SIDE} pixels")));
+            }
+            let Some((space, depth)) = field.strip_prefix('C').and_then(deep_space) else { continue };
+            if !(9..=16).contains(&depth) {
+                return Err(bad(field, format!("samples of {depth} bits, supported are 8 to 16")));
+            }
+            bits = depth;
+            known = line.replacen(field, &format!("C{space}12"), 1);
         }
-        C::C444 | C::C444p10 | C::C444p12 => (1, 1),
-        C::C422 | C::C422p10 | C::C422p12 => (2, 1),
-        _ => (2, 2),
-    };
-    let chroma = |plane: &[u8], i: usize| {
-        let (row, col) = (i / w / sy, i % w / sx);
-        (f32::from(plane[row * w.div_ceil(sx) + col]) - 128.0) * c_scale
-    };
-    out.extend((0..w * h).map(|i| byte(luma(i) + 1.402 * chroma(v, i))));
-    out.extend((0..w * h).map(|i| byte(luma(i) - 0.344_136 * chroma(u, i) - 0.714_136 * chroma(v, i))));
-    out.extend((0..w * h).map(|i| byte(luma(i) + 1.772 * chroma(u, i))));
+        Ok(Self { known, frames, bits, full_range: line.contains("XCOLORRANGE=FULL") })
+    }
+}
+
+/// Longest header line accepted; the decoder's own limit is 1024.
+const MAX_Y4M_HEADER: usize = 1024;
+
+/// A color space of more than 8 bits, such as `420p10` or `mono16`: its name up to the depth, and that.
+fn deep_space(space: &str) -> Option<(&str, u32)> {
+    let name = ["420p", "422p", "444p", "mono"].into_iter().find(|name| space.starts_with(name))?;
+    Some((name, space[name.len()..].parse().ok()?))
+}
+
+/// How luma and chroma become gray or RGB.
+struct Ycc {
+    space: y4m::Colorspace,
+    /// Width and height.
+    size: (usize, usize),
+    bits: u32,
+    full_range: bool,
+}
+
+impl Ycc {
+    fn white(&self) -> f32 {
+        ((1u32 << self.bits) - 1) as f32
+    }
+
+    /// Calls `put` for each sample of a frame, plane by plane, rounded and from 0 to white.
+    fn each(&self, [y, u, v]: [&[u8]; 3], mut put: impl FnMut(f32)) {
+        use y4m::Colorspace as C;
+        let (w, h) = self.size;
+        let white = self.white();
+        // The levels of limited range are those of 8 bits, with zeros after them.
+        let step = (1u32 << (self.bits - 8)) as f32;
+        let (y_scale, y_zero, c_scale) = match self.full_range {
+            true => (1.0, 0.0, 1.0),
+            false => (white / (219.0 * step), 16.0 * step, white / (224.0 * step)),
+        };
+        let deep = self.bits > 8;
+        let sample = |plane: &[u8], i: usize| match deep {
+            true => f32::from(u16::from_le_bytes([plane[2 * i], plane[2 * i + 1]])),
+            false => f32::from(plane[i]),
+        };
+        let luma = |i: usize| (sample(y, i) - y_zero) * y_scale;
+        let mut put = |x: f32| put(x.round().clamp(0.0, white));
+        let (sx, sy) = match self.space {
+            C::Cmono | C::Cmono12 => {
+                (0..w * h).for_each(|i| put(luma(i)));
+                return;
+            }
+            C::C444 | C::C444p10 | C::C444p12 => (1, 1),
+            C::C422 | C::C422p10 | C::C422p12 => (2, 1),
+            _ => (2, 2),
+        };
+        let chroma = |plane: &[u8], i: usize| {
+            let (row, col) = (i / w / sy, i % w / sx);
+            (sample(plane, row * w.div_ceil(sx) + col) - 128.0 * step) * c_scale
+        };
+        (0..w * h).for_each(|i| put(luma(i) + 1.402 * chroma(v, i)));
+        (0..w * h).for_each(|i| put(luma(i) - 0.344_136 * chroma(u, i) - 0.714_136 * chroma(v, i)));
+        (0..w * h).for_each(|i| put(luma(i) + 1.772 * chroma(u, i)));
+    }
 }
 
 /// Writes a video `[T, C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as an endless animated GIF of `fps` frames a second.
@@ -290,8 +360,26 @@ mod tests {
     }
 
     #[test]
+    fn y4m_of_ten_to_sixteen_bits() {
+        for (bits, white) in [(10u32, 1023.0), (12, 4095.0), (16, 65535.0)] {
+            let word = |x: u32| (x << (bits - 8)).to_le_bytes()[..2].to_vec();
+            let mono = [word(16), word(235)].concat();
+            let mono = read_y4m(&y4m_bytes(&format!("W2 H1 F25:1 Cmono{bits}"), &mono, 2)).unwrap();
+            assert_eq!((mono.shape(), mono.white()), (&[2, 1, 1, 2][..], Some(white)));
+            assert_eq!(mono.samples(), &Samples::Floats(vec![0.0, white, 0.0, white]));
+            let gray = [word(16), word(235), word(16), word(235), word(128), word(128)].concat();
+            let header = format!("W2 H2 F25:1 Ip A1:1 C420p{bits} XYSCSS=420P{bits} XCOLORRANGE=LIMITED");
+            let color = read_y4m(&y4m_bytes(&header, &gray, 1)).unwrap();
+            assert_eq!((color.shape(), color.stored()), (&[1, 3, 2, 2][..], SampleType::U16));
+            assert_eq!(color.samples(), &Samples::Floats([0.0, white, 0.0, white].repeat(3)));
+        }
+        let full = read_y4m(&y4m_bytes("W1 H1 F25:1 C444p10 XCOLORRANGE=FULL", &[5, 1, 0, 2, 0, 2], 1)).unwrap();
+        assert_eq!(full.samples(), &Samples::Floats(vec![261.0; 3]));
+    }
+
+    #[test]
     fn hostile_headers_give_errors() {
-        for header in ["W99999999999 H99999999999", "W65536 H65536 C444", "W0 H3", "W-1 H3", "W2 H1 C420p10", ""] {
+        for header in ["W99999999999 H99999999999", "W65536 H65536 C444", "W0 H3", "W-1 H3", "W2 H1 C420p99", ""] {
             assert!(read_y4m(&y4m_bytes(header, &[0; 30], 1)).is_err(), "{header}");
         }
         assert!(read_y4m(&y4m_bytes("W2 H2 Cmono", &[0; 3], 1)).is_err());

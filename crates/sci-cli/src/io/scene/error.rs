@@ -12,7 +12,7 @@ pub enum SceneError {
     #[error(transparent)]
     File(#[from] FileError),
     /// A needed part is missing.
-    #[error("{file}: no variable `{key}` ({part}); it holds {}. Set data.keys if it has another name", list(.present))]
+    #[error("{file}: no variable `{key}` ({part}){}; it holds {}. Set data.keys if it has another name", meant(.near.as_deref()), list(.present))]
     MissingKey {
         /// The file.
         file: String,
@@ -20,6 +20,8 @@ pub enum SceneError {
         key: String,
         /// What it is for.
         part: &'static str,
+        /// The name in the file that may be meant.
+        near: Option<String>,
         /// The names in the file.
         present: Vec<String>,
     },
@@ -46,7 +48,7 @@ pub enum SceneError {
         expected: &'static str,
     },
     /// Two arrays of different picture sizes.
-    #[error("{file}: `{key}` is {}×{} (rows × columns), but `{mask}` is {}×{}; they must be equal", .size.0, .size.1, .mask_size.0, .mask_size.1)]
+    #[error("{file}: `{key}` is {}×{} (rows × columns), but `{mask}` is {}×{}; they must be equal. If frames are not where their axis is expected, data.axes says so: hwt (usual in .mat) or thw (elsewhere)", .size.0, .size.1, .mask_size.0, .mask_size.1)]
     SizeMismatch {
         /// The file.
         file: String,
@@ -97,9 +99,35 @@ pub enum SceneError {
         /// Frames a measurement needs.
         needed: usize,
     },
+    /// A snapshot in color where a sensor's numbers are expected.
+    #[error("{file}: `{key}` is a picture in color, expected gray or a mosaic as the sensor gives it (with data.cfa)")]
+    Color {
+        /// The file.
+        file: String,
+        /// The variable.
+        key: String,
+    },
+    /// A mask that is to move is not one.
+    #[error("{file}: {found} masks, but data.mask_shift moves one: expected [H, W]")]
+    NotOneMask {
+        /// The scene's file.
+        file: String,
+        /// Masks there.
+        found: usize,
+    },
+    /// A mask that cannot move so far.
+    #[error("{file}: data.mask_shift = {:?}, data.frames = {}: {source}", .shift.step, .shift.frames)]
+    Shift {
+        /// The scene's file.
+        file: String,
+        /// How it is to move.
+        shift: super::MaskShift,
+        /// The broken rule.
+        source: MaskError,
+    },
     /// A video where a scene is expected.
     #[error(
-        "{file}: {what} has no masks and measurements. To simulate measurements from it, set data.kind = \"simulate\""
+        "{file}: {what} has no masks and measurements. To simulate measurements from it, set data.kind = \"simulate\"; if it is the measurements, data.mask names the masks' file"
     )]
     NotAScene {
         /// The file.
@@ -107,6 +135,10 @@ pub enum SceneError {
         /// What it is.
         what: &'static str,
     },
+}
+
+fn meant(near: Option<&str>) -> String {
+    near.map_or_else(String::new, |near| format!(" (did you mean `{near}`?)"))
 }
 
 fn list(names: &[String]) -> String {

@@ -4,20 +4,33 @@
 //! frames in `[0, 1]`, measurements up to `Σ_t C_t`. A color scene is one of a Bayer sensor: what is measured, and the
 //! truth it is compared with, is the mosaic; RGB truth is kept beside it.
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
 
-use ndarray::{Array3, Array4, ArrayD, ArrayView2, ArrayView3, ArrayView4, Axis, Ix3, Ix4, IxDyn, s};
+use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, Axis, s};
 use sci_forward::bayer::mosaic_into;
-use sci_forward::{BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, SensingOperator};
+use sci_forward::{
+    BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator,
+};
 
+#[cfg(test)]
+mod camera_tests;
 mod error;
+mod layout;
+mod names;
+mod read;
+mod scale;
+mod sensor;
+mod shift;
+mod source;
 
 pub use error::SceneError;
+pub use read::{Video, read, read_gray_video, read_mask, read_video};
+pub use sensor::{Clip, Sensor};
+pub use shift::MaskShift;
 
-use super::defects::{self, Defects};
-use super::samples::{Array, SampleType, Samples};
-use super::{FileError, Format, NamedArrays, ReadError, frames, mat, npy, read_file};
+use super::defects::Defects;
+use super::raw::Raw;
 
 /// The names under which a file holds the parts of a scene.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -53,19 +66,27 @@ pub enum Axes {
     Thw,
 }
 
-/// How to understand a scene file; `None` means by the file's format.
+/// How to understand a scene file; `None` means by the file's format and content.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Reading {
     /// Names of the parts.
     pub keys: Keys,
     /// Order of axes: `hwt` for .mat, `thw` otherwise.
     pub axes: Option<Axes>,
-    /// What white is in the file: 255 for .mat and for whole numbers, 1 for floats of the other formats.
+    /// What white is in the file: 255 for .mat and for bytes, 1 for floats of the other formats, unless the content says otherwise.
     pub scale: Option<f32>,
     /// The Bayer pattern of the sensor: RGGB where there is RGB truth, none (a gray sensor) otherwise.
     pub cfa: Option<CfaPattern>,
     /// What to do about defective pixels of the sensor.
     pub defects: Defects,
+    /// The masks' own file or folder, of any format, if they are not in the scene's.
+    pub mask: Option<PathBuf>,
+    /// How one mask makes those of all frames.
+    pub shift: Option<MaskShift>,
+    /// What the measurements' file is if it has no header.
+    pub raw: Option<Raw>,
+    /// What the sensor does to the light.
+    pub sensor: Sensor,
 }
 
 /// Masks, measurements and truth that fit together.
@@ -84,6 +105,10 @@ pub struct Scene {
     /// What white is in units of the file's scale. 1 but for measurements that are far off that scale: they, and truth that is too,
     /// are divided by it, so that results have to be multiplied.
     pub unit: f32,
+    /// The noise of the measurements, where solvers are to know of it.
+    pub noise: Option<Noise>,
+    /// What no measurement exceeds, in their unit.
+    pub clip: Option<f32>,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
 }
@@ -162,11 +187,13 @@ impl Scene {
                     file: file.into(),
                     key: keys.meas.clone(),
                     part: "measurements, or the truth to simulate them from",
+                    near: None,
                     present: vec![keys.mask.clone()],
                 });
             }
         };
-        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, warnings };
+        let (noise, clip) = (None, None);
+        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, noise, clip, warnings };
         scene.look_for_wrong_scales(brightest);
         Ok(scene)
     }
@@ -194,7 +221,8 @@ impl Scene {
     /// # Panics
     /// If `k` is not below [`Scene::len`].
     pub fn measurement(&self, k: usize) -> Result<Measurement, MeasurementError> {
-        Ok(Measurement::new(Arc::clone(&self.operator), self.y(k).to_owned())?.with_cfa(self.cfa))
+        let measurement = Measurement::new(Arc::clone(&self.operator), self.y(k).to_owned())?;
+        Ok(measurement.with_cfa(self.cfa).with_noise(self.noise).with_clip(self.clip))
     }
 
     /// y `[H, W]` of measurement `k`.
@@ -294,91 +322,8 @@ fn simulate(
     Ok(y)
 }
 
-/// Reads a scene: a .mat or .npz file, or a folder that holds each part as `<key>.npy`.
-///
-/// # Errors
-/// [`SceneError`] naming the file and the variable at fault.
-pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
-    let file = path.display().to_string();
-    let keys = &reading.keys;
-    let (found, format) = if path.is_dir() {
-        (read_folder(path, keys)?, Format::Npy)
-    } else {
-        let bytes = read_file(path)?;
-        read_container(&bytes, &keys.all())
-            .map_err(|e| FileError::new(path, e))?
-            .ok_or_else(|| SceneError::NotAScene { file: file.clone(), what: "a single array or video" })?
-    };
-    let NamedArrays { names, mut arrays } = found;
-    let mut part = |key: &str, scale: Option<f32>| -> Result<Option<Array3<f32>>, SceneError> {
-        arrays.remove(key).map(|a| to_frames(&file, key, a, format, reading.axes, scale)).transpose()
-    };
-    let mask = part(&keys.mask, Some(1.0))?;
-    let mut meas = part(&keys.meas, reading.scale)?;
-    let orig = part(&keys.orig, reading.scale)?;
-    let missing =
-        |key: &str, part| SceneError::MissingKey { file: file.clone(), key: key.into(), part, present: names.clone() };
-    let mut mask = normalise_mask(mask.ok_or_else(|| missing(&keys.mask, "the masks"))?);
-    let rgb = arrays.remove(&keys.rgb).map(|a| to_channels(&file, &keys.rgb, a, format, reading)).transpose()?;
-    let mut truth = match rgb {
-        Some(rgb) if rgb.len_of(Axis(1)) == 3 => Some(Truth::Rgb(rgb)),
-        Some(gray) => return Err(not_color(&file, &keys.rgb, gray.shape())),
-        None => orig.map(Truth::Sensor),
-    };
-    if meas.is_none() && truth.is_none() {
-        return Err(missing(&keys.meas, "measurements, or `orig` or `rgb` to simulate them from"));
-    }
-    let (mut unit, mut warnings) = (1.0, Vec::new());
-    if let Some(meas) = meas.as_mut().filter(|m| m.shape()[1..] == mask.shape()[1..]) {
-        if reading.scale.is_none() {
-            unit = rescale(&mask, meas, truth.as_mut(), &mut warnings);
-        }
-        let color = reading.cfa.is_some() || matches!(truth, Some(Truth::Rgb(_)));
-        let defects = defects::find(mask.sum_axis(Axis(0)).view(), meas.view(), if color { 2 } else { 1 });
-        if let Some(named) = defects::named(&defects) {
-            warnings.push(match reading.defects {
-                Defects::Exclude => format!("pixels left out as not measured: {named}"),
-                Defects::Keep => format!("pixels look defective: {named}; data.defects = \"exclude\" leaves them out"),
-            });
-        }
-        if reading.defects == Defects::Exclude {
-            defects::exclude(&defects, &mut mask, meas);
-        }
-    }
-    let mut scene = Scene::new(&file, keys, mask, meas, truth, reading.cfa)?;
-    scene.unit = unit;
-    warnings.append(&mut scene.warnings);
-    scene.warnings = warnings;
-    Ok(scene)
-}
-
 /// White is here, in units of the file's scale; a scene may be darker than white, but a sensor's 8 bits end at the lower one.
 const PLAUSIBLE_WHITE: std::ops::RangeInclusive<f32> = 1.0 / 64.0..=4.0;
-
-/// Brings measurements that are far off their scale, and truth that is too, to one on which the brightest hundredth is white; returns
-/// what white was.
-fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>, warnings: &mut Vec<String>) -> f32 {
-    let open = mask.sum_axis(Axis(0));
-    let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
-    let Some(white) = brightest_hundredth(light) else { return 1.0 };
-    if white <= 0.0 || PLAUSIBLE_WHITE.contains(&white) {
-        return 1.0;
-    }
-    *meas /= white;
-    let values = match truth {
-        None => None,
-        Some(Truth::Sensor(x)) => Some(x.view_mut().into_dyn()),
-        Some(Truth::Rgb(x)) => Some(x.view_mut().into_dyn()),
-    };
-    let is_off = |v: f32| v > 0.0 && !PLAUSIBLE_WHITE.contains(&v);
-    if let Some(mut x) = values.filter(|x| brightest_hundredth(x.iter().copied()).is_some_and(is_off)) {
-        x /= white;
-    }
-    warnings.push(format!(
-        "measurements are off their scale: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
-    ));
-    white
-}
 
 /// The value that a hundredth of the finite ones exceed.
 fn brightest_hundredth(values: impl Iterator<Item = f32>) -> Option<f32> {
@@ -387,227 +332,10 @@ fn brightest_hundredth(values: impl Iterator<Item = f32>) -> Option<f32> {
     Some(*finite.select_nth_unstable_by(rank, f32::total_cmp).1)
 }
 
-fn not_color(file: &str, key: &str, shape: &[usize]) -> SceneError {
-    let expected = "three colors: [T, H, W, 3] or [T, 3, H, W], in .mat [H, W, 3, T]";
-    SceneError::Axes { file: file.into(), key: key.into(), shape: shape.to_vec(), expected }
-}
-
-/// Masks saved as black-and-white images run to 255.
-fn normalise_mask(mut mask: Array3<f32>) -> Array3<f32> {
-    if mask.iter().all(|&v| v == 0.0 || v == 255.0) {
-        mask /= 255.0;
-    }
-    mask
-}
-
-/// The named arrays of a .mat or .npz file; `None` for a file of another known format.
-fn read_container(bytes: &[u8], wanted: &[&str]) -> Result<Option<(NamedArrays, Format)>, ReadError> {
-    Ok(match Format::of(bytes)? {
-        Format::Mat => Some((mat::read(bytes, wanted)?, Format::Mat)),
-        Format::Npz => Some((npy::read_npz(bytes, wanted)?, Format::Npz)),
-        _ => None,
-    })
-}
-
-fn read_folder(path: &Path, keys: &Keys) -> Result<NamedArrays, SceneError> {
-    let mut found = NamedArrays::default();
-    for key in keys.all() {
-        let member = path.join(format!("{key}.npy"));
-        if member.is_file() {
-            let array = npy::read_npy(&read_file(&member)?).map_err(|e| FileError::new(&member, e))?;
-            found.names.push(key.to_owned());
-            found.arrays.insert(key.to_owned(), array);
-        }
-    }
-    if found.names.is_empty() {
-        frames::list(path)?;
-        return Err(SceneError::NotAScene { file: path.display().to_string(), what: "a folder of frames" });
-    }
-    Ok(found)
-}
-
-/// An array of 2 or 3 axes as `[T, H, W]`, divided by its scale.
-fn to_frames(
-    file: &str,
-    key: &str,
-    array: Array,
-    format: Format,
-    axes: Option<Axes>,
-    scale: Option<f32>,
-) -> Result<Array3<f32>, SceneError> {
-    let scale = scale.unwrap_or_else(|| default_scale(format, array.stored()));
-    let wrong = |shape: &[usize]| SceneError::Axes {
-        file: file.into(),
-        key: key.into(),
-        shape: shape.to_vec(),
-        expected: "two axes (one frame) or three, none of length 0",
-    };
-    let mut data = to_f32(array, scale);
-    if format == Format::Mat {
-        data = data.reversed_axes();
-    }
-    let shape = data.shape().to_vec();
-    if data.is_empty() {
-        return Err(wrong(&shape));
-    }
-    let data = match (data.ndim(), axes.unwrap_or(default_axes(format))) {
-        (2, _) => data.insert_axis(Axis(0)),
-        (3, Axes::Thw) => data,
-        (3, Axes::Hwt) => data.permuted_axes(IxDyn(&[2, 0, 1])),
-        _ => return Err(wrong(&shape)),
-    };
-    let data = data.into_dimensionality::<Ix3>().map_err(|_| wrong(&shape))?;
-    Ok(data.as_standard_layout().into_owned())
-}
-
-/// The order of axes, unless the config says.
-fn default_axes(format: Format) -> Axes {
-    if format == Format::Mat { Axes::Hwt } else { Axes::Thw }
-}
-
-/// What white is stored as, unless the config says.
-fn default_scale(format: Format, stored: SampleType) -> f32 {
-    if format == Format::Mat || stored.is_integer() { 255.0 } else { 1.0 }
-}
-
-fn to_f32(array: Array, scale: f32) -> ArrayD<f32> {
-    let shape = IxDyn(array.shape());
-    let values = match array.samples() {
-        Samples::Bytes(v) => v.iter().map(|&b| f32::from(b) / scale).collect(),
-        Samples::Floats(v) => v.iter().map(|&x| x / scale).collect::<Vec<_>>(),
-    };
-    ArrayD::from_shape_vec(shape, values).expect("an Array's shape holds exactly its samples")
-}
-
-/// Reads any video as gray `[T, H, W]` in `[0, 1]`: [`read_video`], whose color becomes luma,
-/// 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601, as MATLAB's `rgb2gray`).
-///
-/// # Errors
-/// [`SceneError`] naming the file and what is wrong with it.
-pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Array3<f32>, SceneError> {
-    Ok(luma(read_video(path, reading)?))
-}
-
-/// Reads any video, gray `[T, 1, H, W]` or color `[T, 3, H, W]`, in `[0, 1]`: GIF, Y4M, a folder of pictures, or the
-/// `orig` (else `rgb`) of a file of arrays.
-///
-/// # Errors
-/// [`SceneError`] naming the file and what is wrong with it.
-pub fn read_video(path: &Path, reading: &Reading) -> Result<Array4<f32>, SceneError> {
-    let file = path.display().to_string();
-    // Pictures have the one order that their reader gives them.
-    let frames = |array| to_channels(&file, "frames", array, Format::Npy, &Reading { axes: None, ..reading.clone() });
-    if path.is_dir() {
-        return frames(frames::read(path)?);
-    }
-    let bytes = read_file(path)?;
-    let read_error = |e| FileError::new(path, e);
-    match Format::of(&bytes).map_err(read_error)? {
-        Format::Gif | Format::Y4m => frames(super::read_video(&bytes).map_err(read_error)?),
-        Format::Png | Format::Jpeg => Err(SceneError::TooFewFrames { file, frames: 1, needed: 2 }),
-        Format::Npy => to_channels(&file, "array", npy::read_npy(&bytes).map_err(read_error)?, Format::Npy, reading),
-        Format::Mat | Format::Npz => {
-            let keys = &reading.keys;
-            let (mut found, format) = read_container(&bytes, &[&keys.orig, &keys.rgb])
-                .map_err(read_error)?
-                .ok_or_else(|| read_error(ReadError::UnknownFormat))?;
-            let key = if found.arrays.contains_key(&keys.orig) { &keys.orig } else { &keys.rgb };
-            let Some(array) = found.arrays.remove(key) else {
-                return Err(SceneError::MissingKey {
-                    file,
-                    key: keys.orig.clone(),
-                    part: "the video",
-                    present: found.names,
-                });
-            };
-            to_channels(&file, key, array, format, reading)
-        }
-    }
-}
-
-/// A video as `[T, C, H, W]`, C = 1 or 3, divided by its scale.
-fn to_channels(
-    file: &str,
-    key: &str,
-    array: Array,
-    format: Format,
-    reading: &Reading,
-) -> Result<Array4<f32>, SceneError> {
-    if array.shape().len() != 4 {
-        return Ok(to_frames(file, key, array, format, reading.axes, reading.scale)?.insert_axis(Axis(1)));
-    }
-    let scale = reading.scale.unwrap_or_else(|| default_scale(format, array.stored()));
-    let mut data = to_f32(array, scale);
-    if format == Format::Mat {
-        data = data.reversed_axes();
-    }
-    let axes = reading.axes.unwrap_or(default_axes(format));
-    let order = match (axes, data.shape()) {
-        _ if data.is_empty() => None,
-        (Axes::Hwt, [_, _, 1 | 3, _]) => Some([3, 2, 0, 1]),
-        (Axes::Thw, [_, 1 | 3, _, _]) => Some([0, 1, 2, 3]),
-        (Axes::Thw, [_, _, _, 1 | 3]) => Some([0, 3, 1, 2]),
-        _ => None,
-    };
-    let shape = data.shape().to_vec();
-    order
-        .and_then(|order| data.permuted_axes(IxDyn(&order)).into_dimensionality::<Ix4>().ok())
-        .map(|data| data.as_standard_layout().into_owned())
-        .ok_or_else(|| SceneError::Axes {
-            file: file.into(),
-            key: key.into(),
-            shape,
-            expected: "[T, H, W], [T, 1, H, W], [T, 3, H, W] or [T, H, W, 3] (in .mat [H, W, 3, T]), none of length 0",
-        })
-}
-
-/// A video `[T, C, H, W]`, C = 1 or 3, as luma.
-fn luma(video: Array4<f32>) -> Array3<f32> {
-    if video.len_of(Axis(1)) == 1 {
-        return video.index_axis_move(Axis(1), 0);
-    }
-    let mut gray = Array3::zeros(video.index_axis(Axis(1), 0).raw_dim());
-    for (channel, weight) in video.axis_iter(Axis(1)).zip([0.299, 0.587, 0.114]) {
-        gray.scaled_add(weight, &channel);
-    }
-    gray
-}
-
-/// Reads masks `[B, H, W]` alone, from a file of arrays (`mask`), a `.npy`, or a folder of PNGs.
-///
-/// # Errors
-/// [`SceneError`] naming the file and what is wrong with it.
-pub fn read_mask(path: &Path, reading: &Reading) -> Result<MaskStack, SceneError> {
-    let file = path.display().to_string();
-    let keys = &reading.keys;
-    let masks = if path.is_dir() && !path.join(format!("{}.npy", keys.mask)).is_file() {
-        luma(to_channels(&file, "frames", frames::read(path)?, Format::Npy, &Reading::default())?)
-    } else {
-        let member = if path.is_dir() { path.join(format!("{}.npy", keys.mask)) } else { path.to_owned() };
-        let bytes = read_file(&member)?;
-        let read_error = |e| FileError::new(path, e);
-        let (array, format) = match Format::of(&bytes).map_err(read_error)? {
-            Format::Npy => (npy::read_npy(&bytes).map_err(read_error)?, Format::Npy),
-            _ => {
-                let (mut found, format) = read_container(&bytes, &[&keys.mask])
-                    .map_err(read_error)?
-                    .ok_or_else(|| FileError::new(path, ReadError::UnknownFormat))?;
-                let array = found.arrays.remove(&keys.mask).ok_or_else(|| SceneError::MissingKey {
-                    file: file.clone(),
-                    key: keys.mask.clone(),
-                    part: "the masks",
-                    present: found.names,
-                })?;
-                (array, format)
-            }
-        };
-        to_frames(&file, &keys.mask, array, format, reading.axes, Some(1.0))?
-    };
-    MaskStack::new(normalise_mask(masks)).map_err(|source| SceneError::Mask { file, key: keys.mask.clone(), source })
-}
-
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::io::mat::{Variable, write_v5};
 

@@ -1,0 +1,174 @@
+//! Owns the step from an array as stored to frames in the program's layout and unit.
+
+use ndarray::{Array3, Array4, ArrayD, Axis, Ix3, Ix4, IxDyn};
+
+use super::{Axes, SceneError};
+use crate::io::Format;
+use crate::io::samples::{Array, Samples};
+
+/// Which array of which file, for messages, and how it is stored.
+#[derive(Clone, Copy)]
+pub(super) struct Place<'a> {
+    pub(super) file: &'a str,
+    pub(super) key: &'a str,
+    pub(super) format: Format,
+    /// The order of axes, unless by the format.
+    pub(super) axes: Option<Axes>,
+}
+
+impl Place<'_> {
+    /// Pictures have the one order that their reader gives them.
+    pub(super) fn is_picture(&self) -> bool {
+        !matches!(self.format, Format::Mat | Format::Hdf5 | Format::Npz | Format::Npy)
+    }
+
+    fn axes(&self) -> Axes {
+        let usual = if self.format == Format::Mat { Axes::Hwt } else { Axes::Thw };
+        if self.is_picture() { usual } else { self.axes.unwrap_or(usual) }
+    }
+
+    fn wrong(&self, shape: &[usize], expected: &'static str) -> SceneError {
+        SceneError::Axes { file: self.file.into(), key: self.key.into(), shape: shape.to_vec(), expected }
+    }
+
+    /// As `f32`, divided by white, in the order of axes that the file means.
+    fn values(&self, array: &Array, white: f32) -> ArrayD<f32> {
+        let shape = IxDyn(array.shape());
+        let values = match array.samples() {
+            Samples::Bytes(v) => v.iter().map(|&b| f32::from(b) / white).collect(),
+            Samples::Floats(v) => v.iter().map(|&x| x / white).collect::<Vec<_>>(),
+        };
+        let data = ArrayD::from_shape_vec(shape, values).expect("an Array's shape holds exactly its samples");
+        if self.format == Format::Mat { data.reversed_axes() } else { data }
+    }
+
+    /// Leaves out axes of length 1, the outermost first, until `most` are left or all others are longer.
+    fn squeezed(&self, mut data: ArrayD<f32>, most: usize) -> ArrayD<f32> {
+        while data.ndim() > most {
+            let mut ones = (0..data.ndim()).filter(|&axis| data.len_of(Axis(axis)) == 1);
+            let outermost = if self.axes() == Axes::Thw { ones.next() } else { ones.next_back() };
+            match outermost {
+                Some(axis) => data = data.index_axis_move(Axis(axis), 0),
+                None => break,
+            }
+        }
+        data
+    }
+
+    fn three(&self, data: ArrayD<f32>) -> Result<Array3<f32>, SceneError> {
+        const EXPECTED: &str = "two axes (one frame) or three, none of length 0, and any number of length 1";
+        let shape = data.shape().to_vec();
+        let data = self.squeezed(data, 3);
+        if data.is_empty() {
+            return Err(self.wrong(&shape, EXPECTED));
+        }
+        let data = match (data.ndim(), self.axes()) {
+            (2, _) => data.insert_axis(Axis(0)),
+            (3, Axes::Thw) => data,
+            (3, Axes::Hwt) => data.permuted_axes(IxDyn(&[2, 0, 1])),
+            _ => return Err(self.wrong(&shape, EXPECTED)),
+        };
+        let data = data.into_dimensionality::<Ix3>().map_err(|_| self.wrong(&shape, EXPECTED))?;
+        Ok(data.as_standard_layout().into_owned())
+    }
+
+    /// Gray frames `[T, H, W]`; pictures may be color if all channels are equal.
+    pub(super) fn frames(&self, array: &Array, white: f32) -> Result<Array3<f32>, SceneError> {
+        if !self.is_picture() || array.shape().len() != 4 {
+            return self.three(self.values(array, white));
+        }
+        let pictures = self.channels(array, white)?;
+        let first = pictures.index_axis(Axis(1), 0);
+        if pictures.axis_iter(Axis(1)).any(|channel| channel != first) {
+            return Err(SceneError::Color { file: self.file.into(), key: self.key.into() });
+        }
+        Ok(first.to_owned())
+    }
+
+    /// A video `[T, C, H, W]`, C = 1 or 3.
+    pub(super) fn channels(&self, array: &Array, white: f32) -> Result<Array4<f32>, SceneError> {
+        let data = self.values(array, white);
+        let shape = data.shape().to_vec();
+        let data = self.squeezed(data, 4);
+        let order = match (self.axes(), data.shape()) {
+            _ if data.is_empty() => None,
+            (Axes::Hwt, [_, _, 1 | 3, _]) => Some([3, 2, 0, 1]),
+            (Axes::Thw, [_, 1 | 3, _, _]) => Some([0, 1, 2, 3]),
+            (Axes::Thw, [_, _, _, 1 | 3]) => Some([0, 3, 1, 2]),
+            _ => None,
+        };
+        let Some(order) = order else {
+            return match data.ndim() {
+                0..=3 => Ok(self.three(data)?.insert_axis(Axis(1))),
+                _ => self.three(data).map(|frames| frames.insert_axis(Axis(1))).map_err(|_| {
+                    self.wrong(
+                        &shape,
+                        "[T, H, W], [T, 1, H, W], [T, 3, H, W] or [T, H, W, 3] (in .mat [H, W, 3, T]), none of length 0",
+                    )
+                }),
+            };
+        };
+        let data = data.permuted_axes(IxDyn(&order)).into_dimensionality::<Ix4>();
+        Ok(data.map_err(|_| self.wrong(&shape, "four axes"))?.as_standard_layout().into_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::samples::SampleType;
+
+    fn frames(shape: &[usize], format: Format, axes: Option<Axes>) -> Result<Vec<usize>, String> {
+        let count = shape.iter().product();
+        let array = Array::new(shape.to_vec(), Samples::Bytes(vec![0; count]), SampleType::U8).unwrap();
+        let place = Place { file: "f", key: "mask", format, axes };
+        place.frames(&array, 1.0).map(|f| f.shape().to_vec()).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn axes_of_length_one_are_left_out() {
+        for shape in [&[8, 5, 6][..], &[1, 8, 5, 6], &[8, 1, 5, 6], &[8, 5, 6, 1], &[1, 1, 8, 5, 6, 1]] {
+            assert_eq!(frames(shape, Format::Npy, None).unwrap(), [8, 5, 6], "{shape:?}");
+        }
+        // In MATLAB these are H×W×T×1, H×W×1×T, H×W×1×1 and H×W.
+        for (shape, expected) in [
+            (&[1, 8, 6, 5][..], [8, 5, 6]),
+            (&[8, 1, 6, 5], [8, 5, 6]),
+            (&[1, 1, 6, 5], [1, 5, 6]),
+            (&[6, 5], [1, 5, 6]),
+        ] {
+            assert_eq!(frames(shape, Format::Mat, None).unwrap(), expected, "{shape:?}");
+        }
+        assert_eq!(frames(&[1, 6, 5, 8], Format::Mat, Some(Axes::Thw)).unwrap(), [8, 5, 6]);
+        assert!(frames(&[2, 8, 5, 6], Format::Npy, None).unwrap_err().contains("[2, 8, 5, 6]"));
+        assert!(frames(&[8, 0, 6], Format::Npy, None).is_err());
+    }
+
+    #[test]
+    fn videos_have_channels_wherever_they_are_stored() {
+        let video = |shape: &[usize], format| {
+            let count = shape.iter().product();
+            let array = Array::new(shape.to_vec(), Samples::Bytes(vec![0; count]), SampleType::U8).unwrap();
+            Place { file: "f", key: "orig", format, axes: None }.channels(&array, 1.0).map(|v| v.shape().to_vec())
+        };
+        for (shape, format, expected) in [
+            (&[8, 5, 6][..], Format::Npy, [8, 1, 5, 6]),
+            (&[8, 5, 6, 3], Format::Npy, [8, 3, 5, 6]),
+            (&[1, 8, 3, 5, 6], Format::Npy, [8, 3, 5, 6]),
+            (&[1, 8, 5, 6], Format::Npy, [8, 1, 5, 6]),
+            (&[8, 3, 6, 5], Format::Mat, [8, 3, 5, 6]),
+            (&[1, 8, 6, 5], Format::Mat, [8, 1, 5, 6]),
+        ] {
+            assert_eq!(video(shape, format).unwrap(), expected, "{shape:?}");
+        }
+        assert!(video(&[2, 8, 5, 6], Format::Npy).is_err());
+    }
+
+    #[test]
+    fn gray_pictures_saved_in_color_are_gray() {
+        let place = Place { file: "f", key: "meas", format: Format::Png, axes: None };
+        let array = |v: [u8; 3]| Array::new(vec![1, 3, 1, 1], Samples::Bytes(v.to_vec()), SampleType::U8).unwrap();
+        assert_eq!(place.frames(&array([51; 3]), 255.0).unwrap()[[0, 0, 0]], 0.2);
+        assert!(place.frames(&array([1, 2, 3]), 255.0).unwrap_err().to_string().contains("color"));
+    }
+}

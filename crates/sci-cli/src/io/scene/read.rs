@@ -1,0 +1,390 @@
+//! Owns the reading of scenes, videos and masks: opened, found, laid out, scaled, checked.
+
+use std::path::Path;
+
+use ndarray::{Array3, Array4, ArrayView3, Axis};
+use sci_forward::MaskStack;
+use sci_forward::bayer::mosaic_into;
+
+use super::layout::Place;
+use super::scale::{self, Content};
+use super::source::Source;
+use super::{Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Truth, brightest_hundredth, names};
+use crate::io::samples::Array;
+use crate::io::{NamedArrays, defects};
+
+/// The arrays of a scene as they are stored.
+struct Parts {
+    keys: Keys,
+    names: Vec<String>,
+    mask: Option<Array>,
+    meas: Option<Array>,
+    orig: Option<Array>,
+    rgb: Option<Array>,
+    notes: Vec<String>,
+}
+
+impl Parts {
+    fn of(source: &Source, reading: &Reading) -> Result<Self, SceneError> {
+        if !source.is_named() {
+            if reading.mask.is_none() && reading.raw.is_none() {
+                source.single()?;
+                return Err(SceneError::NotAScene { file: source.file.clone(), what: source.what() });
+            }
+            let (keys, names, notes) = (reading.keys.clone(), Vec::new(), Vec::new());
+            return Ok(Self { keys, names, notes, mask: None, meas: Some(source.single()?), orig: None, rgb: None });
+        }
+        let mut keys = names::resolved(&reading.keys, &source.names()?);
+        if reading.mask.is_some() {
+            keys.mask.clone_from(&reading.keys.mask);
+        }
+        let wanted: Vec<&str> = keys.all().into_iter().skip(usize::from(reading.mask.is_some())).collect();
+        let NamedArrays { names, mut arrays } = source.arrays(&wanted)?;
+        let mut take = |key: &str| arrays.remove(key);
+        let (mask, meas, rgb) = (take(&keys.mask), take(&keys.meas), take(&keys.rgb));
+        let mut orig = take(&keys.orig);
+        // A guess that is no video, but coordinates or the like, was none.
+        let is_video = |a: &Array| a.shape().iter().filter(|&&n| n > 1).count() >= 3;
+        if keys.orig != reading.keys.orig && !orig.as_ref().is_some_and(is_video) {
+            orig = None;
+            keys.orig.clone_from(&reading.keys.orig);
+        }
+        let notes = names::notes(&reading.keys, &keys);
+        Ok(Self { keys, names, mask, meas, orig, rgb, notes })
+    }
+}
+
+/// Reads a scene: a .mat, .h5 or .npz file, a folder that holds each part as `<key>.npy`, or, with masks in a file of their own,
+/// measurements in any format.
+///
+/// # Errors
+/// [`SceneError`] naming the file and the variable at fault.
+pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
+    let source = Source::open(path, reading.raw)?;
+    let mut parts = Parts::of(&source, reading)?;
+    let mut notes = std::mem::take(&mut parts.notes);
+    let mut mask = scene_masks(&source, &mut parts, reading, &mut notes)?;
+    let mut truth = truth(&source, &parts, reading, &mut notes)?;
+    if parts.meas.is_none() && truth.is_none() {
+        return Err(source.missing(
+            &parts.keys.meas,
+            "measurements, or `orig` or `rgb` to simulate them from",
+            parts.names,
+        ));
+    }
+    let stored = parts.meas.take();
+    let key = if source.is_named() { parts.keys.meas.as_str() } else { "measurements" };
+    let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
+    let mut meas = stored.as_ref().map(|array| place.frames(array, 1.0)).transpose()?;
+    let is_color = reading.cfa.is_some() || matches!(truth, Some(Truth::Rgb(_)));
+    if let Some(shift) = reading.shift {
+        mask = moved_masks(&source, mask, (shift, is_color), meas.as_mut(), truth.as_mut(), &mut notes)?;
+    } else if mask.len_of(Axis(0)) == 1 {
+        notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
+    }
+    let (mut unit, mut clip) = (1.0, None);
+    if let (Some(meas), Some(array)) = (meas.as_mut(), &stored) {
+        let (level, note) = reading.sensor.clip.level(meas.view(), mask.sum_axis(Axis(0)).view());
+        notes.extend(note);
+        let black = reading.sensor.black;
+        *meas -= black;
+        let white = white_of_measurements(&place, (array, meas.view()), &mask, truth.as_ref(), reading, &mut notes);
+        *meas /= white;
+        if meas.shape()[1..] == mask.shape()[1..] {
+            if reading.scale.is_none() {
+                unit = rescale(&mask, meas, truth.as_mut(), &mut notes);
+            }
+            look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
+        }
+        clip = level.map(|level| (level - black) / (white * unit));
+    }
+    let mut scene = Scene::new(&source.file, &parts.keys, mask, meas, truth, reading.cfa)?;
+    (scene.unit, scene.clip, scene.noise) = (unit, clip, reading.sensor.noise);
+    notes.append(&mut scene.warnings);
+    scene.warnings = notes;
+    Ok(scene)
+}
+
+/// The masks `[B, H, W]`, from their own file if they have one.
+fn scene_masks(
+    source: &Source,
+    parts: &mut Parts,
+    reading: &Reading,
+    notes: &mut Vec<String>,
+) -> Result<Array3<f32>, SceneError> {
+    if let Some(path) = &reading.mask {
+        return masks_of(&Source::open(path, None)?, reading, notes);
+    }
+    let key = &parts.keys.mask;
+    let Some(array) = parts.mask.take() else {
+        let names = std::mem::take(&mut parts.names);
+        return Err(source.missing(key, "the masks; data.mask names a file of their own", names));
+    };
+    let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
+    Ok(normalised(place.frames(&array, 1.0)?))
+}
+
+/// The masks that a file holds, under their name if it has names.
+fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Result<Array3<f32>, SceneError> {
+    let (array, key) = if source.is_named() {
+        let own = Keys { mask: reading.keys.mask.clone(), ..Keys::default() };
+        let found = names::resolved(&own, &source.names()?).mask;
+        notes.extend(names::notes(&own, &Keys { mask: found.clone(), ..own.clone() }));
+        let NamedArrays { names, mut arrays } = source.arrays(&[found.as_str()])?;
+        // A file with one array says what it is by being there.
+        match (arrays.remove(&found), names.as_slice()) {
+            (Some(array), _) => (array, found),
+            (None, [only]) => {
+                let array = source.arrays(&[only.as_str()])?.arrays.remove(only);
+                (array.ok_or_else(|| source.missing(&found, "the masks", names.clone()))?, only.clone())
+            }
+            (None, _) => return Err(source.missing(&found, "the masks", names)),
+        }
+    } else {
+        (source.single()?, "mask".to_owned())
+    };
+    let place = Place { file: &source.file, key: &key, format: source.format(), axes: reading.axes };
+    let white = match place.is_picture() && array.stored().is_integer() {
+        true => {
+            let white = scale::of_video(&key, &Content::of(&array, source.format()));
+            notes.extend(white.note);
+            white.value
+        }
+        false => 1.0,
+    };
+    let masks = normalised(place.frames(&array, white)?);
+    let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
+        file: source.file.clone(),
+        key: key.clone(),
+        source: source_error,
+    })?;
+    Ok(checked.view().to_owned())
+}
+
+/// Masks saved as black and white run to full scale.
+fn normalised(mut mask: Array3<f32>) -> Array3<f32> {
+    let white = mask.iter().copied().find(|&v| v != 0.0).unwrap_or(1.0);
+    let is_full_scale = [255.0, 1023.0, 4095.0, 16383.0, 65535.0].contains(&white);
+    if is_full_scale && mask.iter().all(|&v| v == 0.0 || v == white) {
+        mask /= white;
+    }
+    mask
+}
+
+/// The truth, in units of white.
+fn truth(
+    source: &Source,
+    parts: &Parts,
+    reading: &Reading,
+    notes: &mut Vec<String>,
+) -> Result<Option<Truth>, SceneError> {
+    let (key, array) = match (&parts.rgb, &parts.orig) {
+        (Some(rgb), _) => (&parts.keys.rgb, rgb),
+        (None, Some(orig)) => (&parts.keys.orig, orig),
+        (None, None) => return Ok(None),
+    };
+    let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
+    let white = white_of_video(&place, array, reading, notes);
+    if parts.rgb.is_none() {
+        return Ok(Some(Truth::Sensor(place.frames(array, white)?)));
+    }
+    let rgb = place.channels(array, white)?;
+    if rgb.len_of(Axis(1)) == 3 {
+        return Ok(Some(Truth::Rgb(rgb)));
+    }
+    let expected = "three colors: [T, H, W, 3] or [T, 3, H, W], in .mat [H, W, 3, T]";
+    Err(SceneError::Axes { file: source.file.clone(), key: key.clone(), shape: rgb.shape().to_vec(), expected })
+}
+
+fn white_of_video(place: &Place<'_>, array: &Array, reading: &Reading, notes: &mut Vec<String>) -> f32 {
+    if let Some(scale) = reading.scale {
+        return scale;
+    }
+    let white = scale::of_video(place.key, &Content::of(array, place.format));
+    notes.extend(white.note);
+    white.value
+}
+
+/// What white is in measurements.
+fn white_of_measurements(
+    place: &Place<'_>,
+    (array, meas): (&Array, ArrayView3<'_, f32>),
+    mask: &Array3<f32>,
+    truth: Option<&Truth>,
+    reading: &Reading,
+    notes: &mut Vec<String>,
+) -> f32 {
+    if let Some(scale) = reading.scale {
+        return scale;
+    }
+    let content = Content::of(array, place.format);
+    let white = if meas.shape()[1..] == mask.shape()[1..] {
+        let mosaic = match truth {
+            Some(Truth::Rgb(rgb)) => {
+                let mut x = Array3::zeros((rgb.len_of(Axis(0)), rgb.len_of(Axis(2)), rgb.len_of(Axis(3))));
+                mosaic_into(reading.cfa.unwrap_or_default(), rgb.view(), x.view_mut());
+                Some(x)
+            }
+            _ => None,
+        };
+        let sensor = match truth {
+            Some(Truth::Sensor(x)) => Some(x.view()),
+            _ => mosaic.as_ref().map(|x| x.view()),
+        };
+        scale::of_measurements(place.key, &content, meas, mask.view(), sensor)
+    } else {
+        scale::of_video(place.key, &content)
+    };
+    notes.extend(white.note);
+    white.value
+}
+
+/// Replaces the one mask by those of all frames, and cuts what was seen to where they are known.
+fn moved_masks(
+    source: &Source,
+    mask: Array3<f32>,
+    (shift, is_color): (super::MaskShift, bool),
+    meas: Option<&mut Array3<f32>>,
+    truth: Option<&mut Truth>,
+    notes: &mut Vec<String>,
+) -> Result<Array3<f32>, SceneError> {
+    let error = |source_error| SceneError::Shift { file: source.file.clone(), shift, source: source_error };
+    let (found, rows, columns) = mask.dim();
+    if found != 1 {
+        return Err(SceneError::NotOneMask { file: source.file.clone(), found });
+    }
+    let moved = shift.masks(mask.index_axis_move(Axis(0), 0), is_color).map_err(error)?;
+    let mut is_cut = meas.is_some_and(|meas| moved.crop(meas));
+    match truth {
+        Some(Truth::Sensor(x)) => is_cut |= moved.crop(x),
+        Some(Truth::Rgb(x)) => is_cut |= moved.crop(x),
+        None => {}
+    }
+    if is_cut {
+        let (_, height, width) = moved.masks.dim();
+        notes.push(format!("of {rows}×{columns} pixels, the moving mask is known in every frame for {height}×{width}; the others are cut off"));
+    }
+    Ok(moved.masks)
+}
+
+/// Names pixels that look defective, and leaves them out if that is asked for.
+fn look_for_defects(
+    mask: &mut Array3<f32>,
+    meas: &mut Array3<f32>,
+    reading: &Reading,
+    is_color: bool,
+    notes: &mut Vec<String>,
+) {
+    let found = defects::find(mask.sum_axis(Axis(0)).view(), meas.view(), if is_color { 2 } else { 1 });
+    if let Some(named) = defects::named(&found) {
+        notes.push(match reading.defects {
+            Defects::Exclude => format!("pixels left out as not measured: {named}"),
+            Defects::Keep => format!("pixels look defective: {named}; data.defects = \"exclude\" leaves them out"),
+        });
+    }
+    if reading.defects == Defects::Exclude {
+        defects::exclude(&found, mask, meas);
+    }
+}
+
+/// Brings measurements that are far off their scale, and truth that is too, to one on which the brightest hundredth is white; returns
+/// what white was.
+fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>, warnings: &mut Vec<String>) -> f32 {
+    let open = mask.sum_axis(Axis(0));
+    let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
+    let Some(white) = brightest_hundredth(light) else { return 1.0 };
+    if white <= 0.0 || PLAUSIBLE_WHITE.contains(&white) {
+        return 1.0;
+    }
+    *meas /= white;
+    let values = match truth {
+        None => None,
+        Some(Truth::Sensor(x)) => Some(x.view_mut().into_dyn()),
+        Some(Truth::Rgb(x)) => Some(x.view_mut().into_dyn()),
+    };
+    let is_off = |v: f32| v > 0.0 && !PLAUSIBLE_WHITE.contains(&v);
+    if let Some(mut x) = values.filter(|x| brightest_hundredth(x.iter().copied()).is_some_and(is_off)) {
+        x /= white;
+    }
+    warnings.push(format!(
+        "measurements are off their scale: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
+    ));
+    white
+}
+
+/// A video, and what is to be said about how it was read.
+#[derive(Clone, Debug)]
+pub struct Video {
+    /// `[T, C, H, W]`, C = 1 or 3, in `[0, 1]`.
+    pub frames: Array4<f32>,
+    /// What looked odd but is no error.
+    pub notes: Vec<String>,
+}
+
+/// Reads any video as gray `[T, 1, H, W]` in `[0, 1]`: [`read_video`], whose color becomes luma,
+/// 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601, as MATLAB's `rgb2gray`).
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_gray_video(path: &Path, reading: &Reading) -> Result<Video, SceneError> {
+    let Video { frames, notes } = read_video(path, reading)?;
+    Ok(Video { frames: luma(frames), notes })
+}
+
+/// Reads any video, gray `[T, 1, H, W]` or color `[T, 3, H, W]`, in `[0, 1]`: a clip, TIFF, GIF, Y4M, a folder of pictures, or the
+/// `orig` (else `rgb`) of a file of arrays.
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_video(path: &Path, reading: &Reading) -> Result<Video, SceneError> {
+    let source = Source::open(path, reading.raw)?;
+    let mut notes = Vec::new();
+    let (array, key) = if source.is_named() {
+        let names = source.names()?;
+        let keys = names::resolved(&reading.keys, &names);
+        let key = if names.contains(&keys.orig) { keys.orig.clone() } else { keys.rgb.clone() };
+        let array = source.arrays(&[key.as_str()])?.arrays.remove(&key);
+        let array = array.ok_or_else(|| source.missing(&reading.keys.orig, "the video", names))?;
+        notes.extend(names::notes(
+            &reading.keys,
+            &Keys { mask: reading.keys.mask.clone(), meas: reading.keys.meas.clone(), ..keys },
+        ));
+        (array, key)
+    } else {
+        (source.video()?, "frames".to_owned())
+    };
+    let place = Place { file: &source.file, key: &key, format: source.format(), axes: reading.axes };
+    if place.is_picture() && array.shape()[0] < 2 && source.what() == "a picture" {
+        return Err(SceneError::TooFewFrames { file: source.file, frames: 1, needed: 2 });
+    }
+    let white = white_of_video(&place, &array, reading, &mut notes);
+    Ok(Video { frames: place.channels(&array, white)?, notes })
+}
+
+/// A video `[T, C, H, W]`, C = 1 or 3, as luma `[T, 1, H, W]`.
+fn luma(video: Array4<f32>) -> Array4<f32> {
+    if video.len_of(Axis(1)) == 1 {
+        return video;
+    }
+    let mut gray = Array3::zeros(video.index_axis(Axis(1), 0).raw_dim());
+    for (channel, weight) in video.axis_iter(Axis(1)).zip([0.299, 0.587, 0.114]) {
+        gray.scaled_add(weight, &channel);
+    }
+    gray.insert_axis(Axis(1))
+}
+
+/// Reads masks `[B, H, W]` alone, from a file of any format or a folder of pictures, and says what is odd about them.
+///
+/// # Errors
+/// [`SceneError`] naming the file and what is wrong with it.
+pub fn read_mask(path: &Path, reading: &Reading) -> Result<(MaskStack, Vec<String>), SceneError> {
+    let source = Source::open(path, None)?;
+    let mut notes = Vec::new();
+    let masks = masks_of(&source, reading, &mut notes)?;
+    let masks = MaskStack::new(masks).map_err(|e| SceneError::Mask {
+        file: source.file,
+        key: reading.keys.mask.clone(),
+        source: e,
+    })?;
+    Ok((masks, notes))
+}
