@@ -90,10 +90,11 @@ pub fn read(bytes: &[u8]) -> Result<Array, ReadError> {
         pages.next_image().map_err(bad)?;
         count += 1;
     }
-    // One page is there as decoded, all of them as converted.
+    // One page is there as decoded, all of them as converted, and one of these once more on its way.
     let page = plan.pixels().saturating_mul(plan.stored);
+    let converted = plan.pixels().saturating_mul(plan.colors);
     budget.claim(page, usize::from(plan.bits).div_ceil(8))?;
-    budget.claim(plan.pixels().saturating_mul(plan.colors).saturating_mul(count), if plan.bits > 8 { 4 } else { 1 })?;
+    budget.claim(converted.saturating_mul(count + usize::from(count > 1)), if plan.bits > 8 { 4 } else { 1 })?;
     let mut pages = open(bytes, &budget)?;
     let mut video: Option<(Samples, SampleType)> = None;
     for index in 0..count {
@@ -115,7 +116,39 @@ pub fn read(bytes: &[u8]) -> Result<Array, ReadError> {
     arrange(samples, kind, &plan, count, &mut budget)
 }
 
+/// Refuses a first directory with values that cannot be in the file. The decoder makes room for them before its limits can be set.
+fn check_first_directory(bytes: &[u8]) -> Result<(), ReadError> {
+    let is_big = bytes.get(2..4).is_some_and(|version| version.contains(&43));
+    let number = |at: usize, size: usize| -> Option<usize> {
+        let mut digits = bytes.get(at..at.checked_add(size)?)?.to_vec();
+        if bytes.starts_with(b"II") {
+            digits.reverse();
+        }
+        digits.iter().try_fold(0usize, |n, &d| n.checked_mul(256)?.checked_add(d.into()))
+    };
+    let (pointer, counter, word, entry) = if is_big { (8, 8, 8, 20) } else { (4, 2, 4, 12) };
+    let cut_short = || bad("cut short inside its first directory");
+    let start = number(pointer, word).ok_or_else(cut_short)?;
+    let entries = number(start, counter).ok_or_else(cut_short)?;
+    for index in 0..entries {
+        let at =
+            index.checked_mul(entry).and_then(|n| n.checked_add(start)?.checked_add(counter)).ok_or_else(cut_short)?;
+        let (tag, kind) = (number(at, 2).ok_or_else(cut_short)?, number(at + 2, 2).ok_or_else(cut_short)?);
+        let count = number(at + 4, word).ok_or_else(cut_short)?;
+        // Bytes and text are kept as they are, numbers take many times their size.
+        let most = if matches!(kind, 1 | 2 | 6 | 7) { bytes.len() } else { bytes.len().min(MAX_VALUES) };
+        if count > most {
+            return Err(bad(format!("tag {tag} claims {count} values, more than the {most} that are possible")));
+        }
+    }
+    Ok(())
+}
+
+/// Values of one tag: a picture has not as many strips.
+const MAX_VALUES: usize = 1 << 20;
+
 fn open<'a>(bytes: &'a [u8], budget: &Budget) -> Result<Pages<'a>, ReadError> {
+    check_first_directory(bytes)?;
     let mut limits = Limits::default();
     limits.decoding_buffer_size = budget.left();
     limits.intermediate_buffer_size = budget.left();
@@ -144,12 +177,18 @@ fn read_page(pages: &mut Pages<'_>, plan: &Plan) -> Result<(Samples, SampleType)
     macro_rules! planes {
         ($samples:expr, $kind:ident, $convert:expr) => {{
             let planes = planes(&$samples, plan, apart)?;
-            (Samples::Floats(planes.map($convert).collect()), SampleType::$kind)
+            let mut converted = Vec::with_capacity(plan.pixels() * plan.colors);
+            converted.extend(planes.map($convert));
+            (Samples::Floats(converted), SampleType::$kind)
         }};
     }
     Ok(match decoded {
         DecodingResult::U8(v) if plan.bits < 8 => (Samples::Bytes(unpacked(&v, plan)?), SampleType::U8),
-        DecodingResult::U8(v) => (Samples::Bytes(planes(&v, plan, apart)?.collect()), SampleType::U8),
+        DecodingResult::U8(v) => {
+            let mut bytes = Vec::with_capacity(plan.pixels() * plan.colors);
+            bytes.extend(planes(&v, plan, apart)?);
+            (Samples::Bytes(bytes), SampleType::U8)
+        }
         DecodingResult::U16(v) => planes!(v, U16, f32::from),
         DecodingResult::U32(v) => planes!(v, U32, |x| x as f32),
         DecodingResult::U64(v) => planes!(v, U64, |x| x as f32),
@@ -185,7 +224,9 @@ fn unpacked(packed: &[u8], plan: &Plan) -> Result<Vec<u8>, ReadError> {
         return Err(bad(format!("{} bytes for rows of {} samples of {bits} bits", packed.len(), plan.width)));
     }
     let each = |row: &[u8], x: usize| (row[x * bits / 8] >> (8 - bits - x * bits % 8)) & (0xff >> (8 - bits));
-    Ok(packed.chunks_exact(row).flat_map(|r| (0..plan.width).map(move |x| each(r, x))).collect())
+    let mut samples = Vec::with_capacity(plan.pixels());
+    packed.chunks_exact(row).for_each(|row| samples.extend((0..plan.width).map(|x| each(row, x))));
+    Ok(samples)
 }
 
 /// The frames of an ImageJ stack that has a directory for the first only.
@@ -418,6 +459,15 @@ mod tests {
         assert_eq!(values(&found), (0..3).flat_map(levels).map(|v| v as f32).collect::<Vec<_>>());
         let error = read(&hyperstack(3, 2)).unwrap_err().to_string();
         assert!(error.contains("cut short: 3 images"), "{error}");
+    }
+
+    #[test]
+    fn values_that_cannot_be_there_are_refused_before_there_is_room_for_them() {
+        let mut bytes = hyperstack(2, 2);
+        // The count of the description's characters: the fifth entry.
+        bytes[10 + 4 * 12 + 4..][..4].copy_from_slice(&[0x0f, 0xf0, 0, 0]);
+        let error = read(&bytes).unwrap_err().to_string();
+        assert!(error.contains("tag 270 claims 267386880 values"), "{error}");
     }
 
     #[test]
