@@ -27,16 +27,7 @@ fn measured(truth: &Array3<f32>, real: &MaskMismatch) -> Array2<f32> {
 
 /// Nothing but a shift, in few solves.
 fn shifts() -> Calibration {
-    Calibration {
-        reach: 1.0,
-        rotation: false,
-        scale: false,
-        clock: false,
-        contrast: false,
-        ends: false,
-        black: false,
-        ..Calibration::default()
-    }
+    Calibration { reach: 1.0, rotation: false, scale: false, contrast: false, black: false, ..Calibration::default() }
 }
 
 fn find(settings: &Calibration, y: Array2<f32>) -> Calibrated {
@@ -76,6 +67,18 @@ fn clock_and_black_level_are_found() {
     let y = measured(truth, &MaskMismatch::default()) + 0.1;
     let found = find(&Calibration { reach: 0.0, black: true, ..shifts() }, y);
     assert!((found.black - 0.1).abs() < 0.04, "{found:?}");
+}
+
+#[test]
+fn light_at_the_ends_is_found_where_things_move() {
+    let truth = &scenes()[0];
+    let y = measured(truth, &MaskMismatch { ends: [0.3, 0.2], ..MaskMismatch::default() });
+    let found = find(&Calibration { reach: 0.0, ends: true, ..shifts() }, y);
+    for (found, real) in found.mismatch.ends.into_iter().zip([0.3, 0.2]) {
+        assert!((found - real).abs() < 0.1, "{found} for {real}");
+    }
+    let found = find(&Calibration { reach: 0.0, ends: true, ..shifts() }, measured(truth, &MaskMismatch::default()));
+    assert_eq!(found.mismatch, MaskMismatch::default());
 }
 
 #[test]

@@ -11,7 +11,8 @@ const LINE_EVERY: Duration = Duration::from_secs(10);
 /// The progress of one measurement.
 #[derive(Debug)]
 pub struct Progress {
-    measurement: usize,
+    /// Of what.
+    name: String,
     iterations: usize,
     bar: Option<ProgressBar>,
     last_line: Instant,
@@ -20,7 +21,12 @@ pub struct Progress {
 impl Progress {
     /// Progress of `iterations` on measurement number `measurement`; nothing is shown before [`Progress::start`].
     pub fn new(measurement: usize, iterations: usize) -> Self {
-        Self { measurement, iterations, bar: None, last_line: Instant::now() }
+        Self::of(&format!("measurement {measurement:>2}"), iterations)
+    }
+
+    /// Progress of `iterations` of anything.
+    pub fn of(name: &str, iterations: usize) -> Self {
+        Self { name: name.to_owned(), iterations, bar: None, last_line: Instant::now() }
     }
 
     /// Begins to show.
@@ -32,7 +38,7 @@ impl Progress {
         let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len}  {msg}  {eta} left")
             .unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = ProgressBar::new(self.iterations as u64).with_style(style);
-        bar.set_prefix(format!("measurement {:>2}", self.measurement));
+        bar.set_prefix(self.name.clone());
         self.bar = Some(bar);
     }
 
@@ -46,7 +52,7 @@ impl Progress {
             }
             None if self.last_line.elapsed() >= LINE_EVERY => {
                 self.last_line = Instant::now();
-                eprintln!("measurement {:>2}   iteration {done} of {}   {quality}", self.measurement, self.iterations);
+                eprintln!("{}   iteration {done} of {}   {quality}", self.name, self.iterations);
             }
             None => {}
         }

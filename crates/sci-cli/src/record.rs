@@ -55,6 +55,9 @@ pub struct Record {
     /// Every other file of the run, relative to the record's folder. A later run may replace and remove these and no others.
     #[serde(default)]
     pub files: Vec<String>,
+    /// How the masks were found to sit, if that was looked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<crate::calibration::Calibration>,
     /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
     /// what it `extends` and the `--set`s.
     pub config: serde_json::Value,

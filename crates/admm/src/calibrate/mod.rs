@@ -38,7 +38,7 @@ const GROUPS: usize = 16;
 /// let real = MaskMismatch { shift: [0.5, 0.0], ..MaskMismatch::default() }.apply(&told)?;
 /// let y = MaskOperator::new(real).forward(Array3::from_shape_fn(shape.dim(), square).view());
 ///
-/// let shifts = Calibration { rotation: false, scale: false, clock: false, contrast: false, ends: false, black: false, ..Calibration::default() };
+/// let shifts = Calibration { rotation: false, scale: false, contrast: false, black: false, ..Calibration::default() };
 /// let found = shifts.find(&told, None, &[y], &mut |_| std::ops::ControlFlow::Continue(()))?;
 /// assert!((found.mismatch.shift[0] - 0.5).abs() < 0.1, "{found:?}");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
@@ -51,11 +51,12 @@ pub struct Calibration {
     pub rotation: bool,
     /// Whether they may be larger or smaller.
     pub scale: bool,
-    /// Whether the frame before or after is seen.
+    /// Whether the frame before or after is seen. Off by default: TV lags behind what moves, and a blend of frames makes up for that, so that
+    /// 0.05 is found as 0.1 to 0.3.
     pub clock: bool,
     /// Whether they have less contrast.
     pub contrast: bool,
-    /// Whether light falls in before the first and after the last frame.
+    /// Whether light falls in before the first and after the last frame. Off by default: where nothing moves it is the same as less contrast.
     pub ends: bool,
     /// Whether y has a black level.
     pub black: bool,
@@ -71,9 +72,9 @@ impl Default for Calibration {
             reach: 2.0,
             rotation: true,
             scale: true,
-            clock: true,
+            clock: false,
             contrast: true,
-            ends: true,
+            ends: false,
             black: true,
             spacing: 10,
             seed: 0,

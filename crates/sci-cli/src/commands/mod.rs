@@ -10,6 +10,7 @@ macro_rules! outln {
     }};
 }
 
+mod calibrate;
 mod mask;
 mod metrics;
 mod report;
@@ -43,6 +44,8 @@ pub struct Cli {
 enum Command {
     /// Run an experiment file
     Run(run::Args),
+    /// Find how the masks really sit, from measurements alone
+    Calibrate(calibrate::Args),
     /// Make masks and measurements from a video
     Simulate(simulate::Args),
     /// Make a stack of masks
@@ -102,6 +105,7 @@ impl Command {
     fn run(self) -> anyhow::Result<Done> {
         match self {
             Command::Run(args) => args.run(),
+            Command::Calibrate(args) => args.run(),
             Command::Simulate(args) => args.run(),
             Command::Mask(args) => args.run(),
             Command::Metrics(args) => args.run(),

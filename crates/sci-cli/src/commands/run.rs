@@ -11,7 +11,8 @@ use ndarray::Axis;
 use sci_forward::{Noise, VideoShape};
 use serde_json::json;
 
-use super::{Done, UsageError, catch_interrupts};
+use super::{Done, UsageError, catch_interrupts, interrupted};
+use crate::calibration::{self, Calibration};
 use crate::config::{self, Experiment, MaskSource, Simulate};
 use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
@@ -54,9 +55,13 @@ impl Args {
         }
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
-        let scene = read_scene(&experiment).context("data.path")?;
+        let mut scene = read_scene(&experiment).context("data.path")?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
         let chosen = choose(&experiment, &scene)?;
+        let calibration = match calibrate(&experiment, &mut scene, &chosen) {
+            Err(_) if interrupted() => return Ok(Done::Interrupted),
+            calibration => calibration?,
+        };
         let mut factory = Factory::new(&experiment, scene.cfa)?;
         let shape = result_shape(&scene);
         let all = [chosen.len() * shape[0], shape[1], shape[2], shape[3]];
@@ -74,7 +79,14 @@ impl Args {
         self.announce(&experiment, &scene, chosen.len(), &folder, &out);
         let solved = solve(&experiment, &scene, &chosen, &mut factory, &mut folder);
         let stopped = folder.finished().iter().filter(|f| f.is_whole()).count();
-        let run = results::Results { experiment: &experiment, scene: &scene, factory: &factory, out: &out, begin };
+        let run = results::Results {
+            experiment: &experiment,
+            scene: &scene,
+            factory: &factory,
+            out: &out,
+            begin,
+            calibration,
+        };
         let done = solved.and_then(|()| run.finish(folder, chosen.len()));
         if done.is_err() && stopped > 0 && RunFolder::is_stopped_in(&out) {
             eprintln!(
@@ -110,6 +122,18 @@ impl Args {
             solved => outln!("going on: {solved} of {count} are solved"),
         }
     }
+}
+
+/// Moves the masks to where they really are, if that is asked for.
+fn calibrate(experiment: &Experiment, scene: &mut Scene, chosen: &[usize]) -> anyhow::Result<Option<Calibration>> {
+    let found = match &experiment.data.calibration {
+        config::Calibration::None => return Ok(None),
+        config::Calibration::File(path) => Calibration::read(path).context("data.calibration")?,
+        config::Calibration::Auto => calibration::find(scene, chosen, &admm::Calibration::default(), interrupted)?,
+    };
+    found.lines().iter().for_each(|line| outln!("{line}"));
+    found.apply(scene)?;
+    Ok(Some(found))
 }
 
 /// Solves what is left, with the pictures made meanwhile.
@@ -189,7 +213,7 @@ fn masks(
     })
 }
 
-fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
+pub(super) fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
     let count = scene.len();
     let chosen = experiment.data.measurements.clone().unwrap_or_else(|| (0..count).collect());
     match chosen.iter().find(|&&k| k >= count) {

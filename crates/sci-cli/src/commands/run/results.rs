@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use super::super::{Done, interrupted};
 use super::result_shape;
+use crate::calibration::Calibration;
 use crate::config::Experiment;
 use crate::factory::Factory;
 use crate::io::output::{WriteError, write_atomically};
@@ -50,6 +51,8 @@ pub(super) struct Results<'r> {
     pub(super) out: &'r Path,
     /// When the command began.
     pub(super) begin: Instant,
+    /// How the masks were found to sit.
+    pub(super) calibration: Option<Calibration>,
 }
 
 impl Results<'_> {
@@ -152,6 +155,7 @@ impl Results<'_> {
             precision_used: self.factory.precision_used(halved)?.to_owned(),
             wall_seconds: self.begin.elapsed().as_secs_f64(),
             files,
+            calibration: self.calibration.clone(),
             config: self.experiment.record_json(),
         })
     }

@@ -161,15 +161,18 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
     Ok(checked.view().to_owned())
 }
 
-/// Masks saved as black and white run to full scale.
+/// Masks as transmittances. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
+/// which the most open pixel is taken to be open.
 fn normalised(mut mask: Array3<f32>) -> Array3<f32> {
-    let white = mask.iter().copied().find(|&v| v != 0.0).unwrap_or(1.0);
-    let is_full_scale = [255.0, 1023.0, 4095.0, 16383.0, 65535.0].contains(&white);
-    if is_full_scale && mask.iter().all(|&v| v == 0.0 || v == white) {
-        mask /= white;
+    let most = mask.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
+    if most > MOST_TRANSMITTANCE {
+        mask /= most;
     }
     mask
 }
+
+/// Gains of single frames may take a transmittance above 1.
+const MOST_TRANSMITTANCE: f32 = 2.0;
 
 /// The truth, in units of white.
 fn truth(

@@ -1,0 +1,179 @@
+//! Owns `calibration.json`: how masks were found to sit, and how a scene takes that.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Context;
+use ndarray::Array2;
+use sci_forward::{MaskMismatch, MaskOperator, MaskStack};
+use serde::{Deserialize, Serialize};
+
+use crate::io::read_file;
+use crate::io::scene::Scene;
+use crate::progress::Progress;
+
+/// The version of the file.
+const SCHEMA: u32 = 1;
+/// Measurements that are looked at, at most: each makes every try so much longer.
+const MOST_MEASUREMENTS: usize = 3;
+
+/// What was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    schema: u32,
+    /// Down and to the right, in pixels.
+    shift: [f64; 2],
+    /// In degrees, from the right down.
+    rotation: f64,
+    scale: f64,
+    /// Share of the frame before, or after if negative.
+    clock: f64,
+    contrast: f64,
+    /// Light before the first and after the last frame, in the unit of the masks.
+    ends: [f64; 2],
+    /// To be taken off the measurements, in units of white.
+    black: f64,
+    /// Share of the held-out pixels' power that is not predicted, with the masks as told and as found.
+    pub error_before: f64,
+    /// The same, as found.
+    pub error_after: f64,
+    /// All that was looked for.
+    pub parameters: Vec<Parameter>,
+    /// Solves that it took.
+    pub solves: usize,
+}
+
+/// A parameter that was looked for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Parameter {
+    /// Its name.
+    pub name: String,
+    /// What was found.
+    pub value: f64,
+    /// One standard deviation; nothing if the measurements do not tell.
+    pub uncertainty: Option<f64>,
+    /// Whether it differs from what was told.
+    pub told_apart: bool,
+    /// Values that were tried, and the errors with them.
+    pub curve: Vec<(f64, f64)>,
+}
+
+/// Looks for the mismatch of a scene's masks, by the first few of these measurements.
+///
+/// # Errors
+/// What [`admm::Calibration::find`] reports, also when `stopped` says so.
+pub fn find(
+    scene: &Scene,
+    measurements: &[usize],
+    settings: &admm::Calibration,
+    stopped: impl Fn() -> bool,
+) -> anyhow::Result<Calibration> {
+    let masks = masks_of(scene)?;
+    let chosen: Vec<Array2<f32>> =
+        measurements.iter().take(MOST_MEASUREMENTS).map(|&k| scene.y(k).to_owned()).collect();
+    let mut shown: Option<Progress> = None;
+    let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| {
+        let bar = shown.get_or_insert_with(|| {
+            let mut bar = Progress::of("calibration", progress.expected);
+            bar.start();
+            bar
+        });
+        bar.step(progress.solves, None);
+        if stopped() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    if let Some(bar) = shown {
+        bar.finish();
+    }
+    Ok(Calibration::of(found.context("calibration")?))
+}
+
+fn masks_of(scene: &Scene) -> anyhow::Result<MaskStack> {
+    let source = scene.operator.masks().context("the scene has no masks to calibrate")?;
+    Ok(MaskStack::from_source(source)?)
+}
+
+impl Calibration {
+    fn of(found: admm::Calibrated) -> Self {
+        let MaskMismatch { shift, rotation, scale, clock, contrast, ends } = found.mismatch;
+        let parameters = found.parameters.into_iter().map(|p| Parameter {
+            name: p.name.to_owned(),
+            value: p.value,
+            uncertainty: Some(p.uncertainty).filter(|u| u.is_finite()),
+            told_apart: p.told_apart,
+            curve: p.curve,
+        });
+        Self {
+            schema: SCHEMA,
+            shift,
+            rotation,
+            scale,
+            clock,
+            contrast,
+            ends,
+            black: found.black,
+            error_before: found.error[0],
+            error_after: found.error[1],
+            parameters: parameters.collect(),
+            solves: found.solves,
+        }
+    }
+
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// Names the file and what is wrong with it.
+    pub fn read(path: &Path) -> anyhow::Result<Self> {
+        let read = || -> anyhow::Result<Self> {
+            let found: Self = serde_json::from_slice(&read_file(path)?)?;
+            anyhow::ensure!(found.schema == SCHEMA, "its schema is {}, expected {SCHEMA}", found.schema);
+            Ok(found)
+        };
+        read().with_context(|| format!("{}: not a calibration of `sci calibrate`", path.display()))
+    }
+
+    /// As a file.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a calibration has only string keys and plain values") + "\n"
+    }
+
+    /// How masks differ from those told.
+    pub fn mismatch(&self) -> MaskMismatch {
+        let Self { shift, rotation, scale, clock, contrast, ends, .. } = *self;
+        MaskMismatch { shift, rotation, scale, clock, contrast, ends }
+    }
+
+    /// The masks as they are.
+    ///
+    /// # Errors
+    /// If nothing of them is left open.
+    pub fn masks(&self, scene: &Scene) -> anyhow::Result<MaskStack> {
+        Ok(self.mismatch().apply(&masks_of(scene)?)?)
+    }
+
+    /// Gives a scene the masks as they are, and takes the black level off its measurements.
+    ///
+    /// # Errors
+    /// As [`Calibration::masks`].
+    pub fn apply(&self, scene: &mut Scene) -> anyhow::Result<()> {
+        scene.operator = Arc::new(MaskOperator::new(self.masks(scene)?));
+        let black = self.black as f32;
+        scene.measurements -= black;
+        scene.clip = scene.clip.map(|level| level - black);
+        Ok(())
+    }
+
+    /// A line for each parameter.
+    pub fn lines(&self) -> Vec<String> {
+        let line = |p: &Parameter| {
+            let value = match p.uncertainty {
+                Some(uncertainty) => format!("{:9.4} ± {uncertainty:.4}", p.value),
+                None => format!("{:9.4}   (not told by the measurements)", p.value),
+            };
+            format!("{:<12} {value}{}", p.name, if p.told_apart { "" } else { "   as told" })
+        };
+        self.parameters.iter().map(line).collect()
+    }
+}
