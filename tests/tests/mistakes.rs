@@ -287,9 +287,9 @@ fn values_that_are_not_finite() {
 fn an_empty_folder() {
     let bench = bench();
     std::fs::create_dir(bench.path("empty")).unwrap();
-    fails(&bench, &["--set", "data.path=empty"], 1, &["data.path", "empty", "no .png or .jpg frames"]);
+    fails(&bench, &["--set", "data.path=empty"], 1, &["data.path", "empty", "no .png, .jpg or .tif frames"]);
     let simulate = ["--set", "data.path=empty", "--set", "data.kind=simulate", "--set", "data.mask={kind=\"random\"}"];
-    fails(&bench, &simulate, 1, &["data.path", "empty", "no .png or .jpg frames"]);
+    fails(&bench, &simulate, 1, &["data.path", "empty", "no .png, .jpg or .tif frames"]);
 }
 
 #[test]
@@ -307,9 +307,9 @@ fn a_truncated_mat() {
 #[test]
 fn a_mat_without_the_keys() {
     let bench = bench();
-    bench.write("scene.mat", scene(8, None, ["phi", "y"]));
-    fails(&bench, &[], 1, &["scene.mat", "no variable `mask`", "`phi`, `y`", "data.keys"]);
-    let named = bench.sci(&["run", "a.toml", "--out", "out", "--set", "data.keys={mask=\"phi\", meas=\"y\"}"]);
+    bench.write("scene.mat", scene(8, None, ["open", "light"]));
+    fails(&bench, &[], 1, &["scene.mat", "no variable `mask`", "`open`, `light`", "data.keys"]);
+    let named = bench.sci(&["run", "a.toml", "--out", "out", "--set", "data.keys={mask=\"open\", meas=\"light\"}"]);
     assert_eq!(named.code, 0, "{}", named.stderr);
 }
 

@@ -28,6 +28,8 @@ pub enum Clip {
 
 /// At least this share of the pixels has the brightest value where it is a limit.
 const CROWDED: f64 = 1e-3;
+/// If more have it, there is nothing to see.
+const BLIND: f64 = 0.5;
 /// Pixels at a limit are open for less than this share of the most open one's time; white behind masks that are open most is no limit.
 const OPENNESS: f64 = 0.95;
 
@@ -77,7 +79,8 @@ fn crowded(meas: ArrayView3<'_, f32>, open: ArrayView2<'_, f32>) -> Option<(f32,
         });
     }
     let share = count as f64 / meas.len() as f64;
-    (count >= 8 && share >= CROWDED && openness / (count as f64) < OPENNESS).then_some((brightest, share))
+    (count >= 8 && (CROWDED..=BLIND).contains(&share) && openness / (count as f64) < OPENNESS)
+        .then_some((brightest, share))
 }
 
 #[cfg(test)]
