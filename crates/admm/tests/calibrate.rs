@@ -85,7 +85,7 @@ fn light_at_the_ends_is_found_where_things_move() {
 fn what_is_out_of_range_is_refused_and_a_stop_is_heard() {
     let y = measured(&scenes()[0], &MaskMismatch::default());
     let wrong = Calibration { reach: -1.0, ..shifts() };
-    let result = wrong.find(&told(), None, &[y.clone()], &mut |_| ControlFlow::Continue(()));
+    let result = wrong.find(&told(), None, std::slice::from_ref(&y), &mut |_| ControlFlow::Continue(()));
     assert!(matches!(result, Err(CalibrateError::Setting { key: "reach", .. })));
     let none = shifts().find(&told(), None, &[], &mut |_| ControlFlow::Continue(()));
     assert!(matches!(none, Err(CalibrateError::Empty)));

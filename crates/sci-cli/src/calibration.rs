@@ -135,6 +135,9 @@ impl Calibration {
     }
 
     /// As a file.
+    ///
+    /// # Panics
+    /// Never: its keys are strings.
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("a calibration has only string keys and plain values") + "\n"
     }

@@ -97,9 +97,9 @@ impl<'s> Search<'s> {
 
     fn rounds(&mut self, count: usize, steps: &mut [f64], wanted: fn(&Axis) -> bool) -> Result<(), CalibrateError> {
         for _ in 0..count {
-            for i in 0..self.axes.len() {
+            for (i, step) in steps.iter_mut().enumerate() {
                 if wanted(&self.axes[i]) {
-                    steps[i] = self.descend(i, steps[i])?;
+                    *step = self.descend(i, *step)?;
                 }
             }
         }

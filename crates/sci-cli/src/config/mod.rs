@@ -1,6 +1,6 @@
 //! Owns an experiment: its tables put together, the rules between them, and what the record shows of it.
 //!
-//! Denoisers are in [`parts`](crate::parts), solvers in [`solvers`](crate::solvers), the tables that are always there in a file each
+//! Denoisers are in [`parts`](crate::parts), solvers in [`solvers`], the tables that are always there in a file each
 //! here. What is read is in range, complete and has an effect, so that no other code has to doubt a value; an error names the file and
 //! line (or the `--set` argument), the key, the value and what is legal.
 
