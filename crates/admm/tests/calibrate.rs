@@ -70,18 +70,6 @@ fn clock_and_black_level_are_found() {
 }
 
 #[test]
-fn light_at_the_ends_is_found_where_things_move() {
-    let truth = &scenes()[0];
-    let y = measured(truth, &MaskMismatch { ends: [0.3, 0.2], ..MaskMismatch::default() });
-    let found = find(&Calibration { reach: 0.0, ends: true, ..shifts() }, y);
-    for (found, real) in found.mismatch.ends.into_iter().zip([0.3, 0.2]) {
-        assert!((found - real).abs() < 0.1, "{found} for {real}");
-    }
-    let found = find(&Calibration { reach: 0.0, ends: true, ..shifts() }, measured(truth, &MaskMismatch::default()));
-    assert_eq!(found.mismatch, MaskMismatch::default());
-}
-
-#[test]
 fn what_is_out_of_range_is_refused_and_a_stop_is_heard() {
     let y = measured(&scenes()[0], &MaskMismatch::default());
     let wrong = Calibration { reach: -1.0, ..shifts() };

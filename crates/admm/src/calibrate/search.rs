@@ -6,9 +6,6 @@ use std::ops::RangeInclusive;
 
 /// Rounds through all parameters.
 const ROUNDS: usize = 6;
-/// Rounds with what is looked for late, and the most that it may leave of the error.
-const LATE_ROUNDS: usize = 3;
-const WORTH: f64 = 0.9;
 /// Standard deviations by which a value must differ from what was told.
 const APART: f64 = 2.0;
 
@@ -21,15 +18,12 @@ struct Axis {
     /// The first step.
     step: f64,
     range: (f64, f64),
-    /// Looked for once all others are found, and believed only if it explains much: see [`Search::late`].
-    late: bool,
 }
 
 /// All axes that the settings ask for, shifts first.
 fn axes(settings: &Calibration) -> Vec<Axis> {
     let axis = |wanted: bool, name, step, range: RangeInclusive<f64>, get, set| {
-        let late = ["first end", "last end"].contains(&name);
-        wanted.then_some(Axis { name, get, set, step, range: (*range.start(), *range.end()), late })
+        wanted.then_some(Axis { name, get, set, step, range: (*range.start(), *range.end()) })
     };
     let (shifts, reach) = (settings.reach > 0.0, -settings.reach..=settings.reach);
     let all = [
@@ -39,8 +33,6 @@ fn axes(settings: &Calibration) -> Vec<Axis> {
         axis(settings.scale, "scale", 2e-3, 0.97..=1.03, |p| p.mismatch.scale, |p, v| p.mismatch.scale = v),
         axis(settings.clock, "clock", 0.05, -0.5..=0.5, |p| p.mismatch.clock, |p, v| p.mismatch.clock = v),
         axis(settings.contrast, "contrast", 0.05, 0.3..=1.5, |p| p.mismatch.contrast, |p, v| p.mismatch.contrast = v),
-        axis(settings.ends, "first end", 0.1, -0.5..=2.0, |p| p.mismatch.ends[0], |p, v| p.mismatch.ends[0] = v),
-        axis(settings.ends, "last end", 0.1, -0.5..=2.0, |p| p.mismatch.ends[1], |p, v| p.mismatch.ends[1] = v),
         axis(settings.black, "black level", 0.01, -0.3..=0.5, |p| p.black, |p, v| p.black = v),
     ];
     all.into_iter().flatten().collect()
@@ -80,55 +72,26 @@ impl<'s> Search<'s> {
         let first = self.best_errors.total();
         self.grid()?;
         let mut steps: Vec<f64> = self.axes.iter().map(|axis| axis.step).collect();
-        self.rounds(ROUNDS, &mut steps, |axis| !axis.late)?;
-        self.late(&mut steps)?;
+        for _ in 0..ROUNDS {
+            for (i, step) in steps.iter_mut().enumerate() {
+                *step = self.descend(i, *step)?;
+            }
+        }
         let uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
         let apart = self.leave_as_told(&told, &uncertainties)?;
         let parameters = self.parameters(&uncertainties, &apart);
-        let found = self.judge.in_units(&self.best);
         Ok(Calibrated {
-            mismatch: found.mismatch,
-            black: found.black * self.judge.level,
+            mismatch: self.best.mismatch,
+            black: self.best.black * self.judge.level,
             error: [first, self.best_errors.total()],
             parameters,
             solves: self.solves,
         })
     }
 
-    fn rounds(&mut self, count: usize, steps: &mut [f64], wanted: fn(&Axis) -> bool) -> Result<(), CalibrateError> {
-        for _ in 0..count {
-            for (i, step) in steps.iter_mut().enumerate() {
-                if wanted(&self.axes[i]) {
-                    *step = self.descend(i, *step)?;
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Light at the ends of the exposure is, for a scene that stands still, the same as less contrast. It is believed only if it leaves
-    /// far less to explain.
-    fn late(&mut self, steps: &mut [f64]) -> Result<(), CalibrateError> {
-        if !self.axes.iter().any(|axis| axis.late) {
-            return Ok(());
-        }
-        let (before, errors) = (self.best, self.best_errors);
-        // The others may have to move with them.
-        self.axes
-            .iter()
-            .zip(&mut *steps)
-            .filter(|(axis, _)| !axis.late)
-            .for_each(|(axis, step)| *step = 0.25 * axis.step);
-        self.rounds(LATE_ROUNDS, steps, |_| true)?;
-        if self.best_errors.total() > WORTH * errors.total() {
-            (self.best, self.best_errors) = (before, errors);
-        }
-        Ok(())
-    }
-
     fn expected(&self) -> usize {
         let side = 2 * self.reach.floor() as usize + 1;
-        side * side + (3 * (ROUNDS + LATE_ROUNDS) + 3) * self.axes.len()
+        side * side + (3 * ROUNDS + 3) * self.axes.len()
     }
 
     fn errors(&mut self, point: &Point) -> Result<Errors, CalibrateError> {

@@ -33,9 +33,6 @@ pub(super) struct Args {
     /// Look for a share of the neighbouring frame too (found too large where much moves)
     #[arg(long)]
     clock: bool,
-    /// Look for light before the first and after the last frame too
-    #[arg(long)]
-    ends: bool,
 }
 
 fn parse_reach(text: &str) -> Result<f64, String> {
@@ -54,8 +51,8 @@ impl Args {
         let scene = read_scene(&experiment).context("data.path")?;
         scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
         let chosen = choose(&experiment, &scene)?;
-        let Self { reach, clock, ends, .. } = self;
-        let settings = admm::Calibration { reach, clock, ends, ..admm::Calibration::default() };
+        let Self { reach, clock, .. } = self;
+        let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };
         let found = match calibration::find(&scene, &chosen, &settings, interrupted) {
             Err(_) if interrupted() => return Ok(Done::Interrupted),
             found => found?,
