@@ -105,3 +105,32 @@ fn a_level_that_is_no_number_is_refused() {
         assert!(run.stderr.contains("data.sensor"), "{set}: {}", run.stderr);
     }
 }
+
+/// Nothing tells the unit of masks that exceed 1 by far: the result is the same whatever it is, and white is bright.
+#[test]
+fn the_unit_of_masks_does_not_matter() {
+    let bench = bench(&[]);
+    let read = |name: &str| {
+        let mut scene = ndarray_npy::NpzReader::new(fs::File::open(bench.path("scene.npz")).unwrap()).unwrap();
+        scene.by_name::<ndarray::OwnedRepr<f32>, ndarray::Ix3>(name).unwrap()
+    };
+    let (mask, meas) = (read("mask"), read("meas"));
+    let gray = mask.mapv(|c| 0.1 + 0.8 * c);
+    let recon = |unit: f32, gain: f32| {
+        let mut file = ndarray_npy::NpzWriter::new(fs::File::create(bench.path("unit.npz")).unwrap());
+        file.add_array("mask", &(&gray * unit)).unwrap();
+        file.add_array("meas", &(&meas * gain)).unwrap();
+        file.finish().unwrap();
+        let args = ["run", "a.toml", "--set", "data.path=unit.npz", "--set", "output=minimal", "--out", "out"];
+        let run = bench.sci(&args);
+        assert!(run.code == 0 && run.stderr.contains("unit of their own"), "{}", run.stderr);
+        let recon: ndarray::ArrayD<f32> = ndarray_npy::read_npy(bench.path("out/recon.npy")).unwrap();
+        let brightest = recon.iter().copied().fold(0.0, f32::max);
+        recon / brightest
+    };
+    let first = recon(113.0, 0.3);
+    for (unit, gain) in [(255.0, 0.3), (113.0, 0.05), (10.0, 1.0)] {
+        let off = (recon(unit, gain) - &first).fold(0f32, |m, d| m.max(d.abs()));
+        assert!(off < 1e-3, "masks × {unit}, y × {gain}: {off}");
+    }
+}

@@ -63,7 +63,7 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     let source = Source::open(path, reading.raw)?;
     let mut parts = Parts::of(&source, reading)?;
     let mut notes = std::mem::take(&mut parts.notes);
-    let mut mask = scene_masks(&source, &mut parts, reading, &mut notes)?;
+    let (mut mask, in_own_unit) = scene_masks(&source, &mut parts, reading, &mut notes)?;
     let mut truth = truth(&source, &parts, reading, &mut notes)?;
     if parts.meas.is_none() && truth.is_none() {
         return Err(source.missing(
@@ -92,7 +92,7 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
         *meas /= white;
         if meas.shape()[1..] == mask.shape()[1..] {
             if reading.scale.is_none() {
-                unit = rescale(&mask, meas, truth.as_mut(), &mut notes);
+                unit = rescale((&mask, in_own_unit), meas, truth.as_mut(), &mut notes);
             }
             look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
         }
@@ -105,13 +105,13 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     Ok(scene)
 }
 
-/// The masks `[B, H, W]`, from their own file if they have one.
+/// The masks `[B, H, W]`, from their own file if they have one, and whether they were in a unit of their own.
 fn scene_masks(
     source: &Source,
     parts: &mut Parts,
     reading: &Reading,
     notes: &mut Vec<String>,
-) -> Result<Array3<f32>, SceneError> {
+) -> Result<(Array3<f32>, bool), SceneError> {
     if let Some(path) = &reading.mask {
         return masks_of(&Source::open(path, None)?, reading, notes);
     }
@@ -125,7 +125,7 @@ fn scene_masks(
 }
 
 /// The masks that a file holds, under their name if it has names.
-fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Result<Array3<f32>, SceneError> {
+fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Result<(Array3<f32>, bool), SceneError> {
     let (array, key) = if source.is_named() {
         let own = Keys { mask: reading.keys.mask.clone(), ..Keys::default() };
         let found = names::resolved(&own, &source.names()?).mask;
@@ -152,24 +152,29 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
         }
         false => 1.0,
     };
-    let masks = normalised(place.frames(&array, white)?);
+    let (masks, in_own_unit) = normalised(place.frames(&array, white)?);
     let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
         file: source.file.clone(),
         key: key.clone(),
         source: source_error,
     })?;
-    Ok(checked.view().to_owned())
+    Ok((checked.view().to_owned(), in_own_unit))
 }
 
-/// Masks as transmittances. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
+/// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
 /// which the most open pixel is taken to be open.
-fn normalised(mut mask: Array3<f32>) -> Array3<f32> {
+fn normalised(mut mask: Array3<f32>) -> (Array3<f32>, bool) {
     let most = mask.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
-    if most > MOST_TRANSMITTANCE {
-        mask /= most;
+    if most <= MOST_TRANSMITTANCE {
+        return (mask, false);
     }
-    mask
+    let is_black_and_white = FULL_SCALES.contains(&most) && mask.iter().all(|&v| v == 0.0 || v == most);
+    mask /= most;
+    (mask, !is_black_and_white)
 }
+
+/// White of pictures.
+const FULL_SCALES: [f32; 5] = [255.0, 1023.0, 4095.0, 16383.0, 65535.0];
 
 /// Gains of single frames may take a transmittance above 1.
 const MOST_TRANSMITTANCE: f32 = 2.0;
@@ -290,13 +295,19 @@ fn look_for_defects(
     }
 }
 
-/// Brings measurements that are far off their scale, and truth that is too, to one on which the brightest hundredth is white; returns
-/// what white was.
-fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>, warnings: &mut Vec<String>) -> f32 {
+/// Brings measurements that are far off their scale, or have none as their masks were in a unit of their own, and truth that is too, to
+/// one on which the brightest hundredth is white; returns what white was.
+fn rescale(
+    (mask, in_own_unit): (&Array3<f32>, bool),
+    meas: &mut Array3<f32>,
+    truth: Option<&mut Truth>,
+    warnings: &mut Vec<String>,
+) -> f32 {
     let open = mask.sum_axis(Axis(0));
     let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
     let Some(white) = brightest_hundredth(light) else { return 1.0 };
-    if white <= 0.0 || PLAUSIBLE_WHITE.contains(&white) {
+    let unknown = in_own_unit && truth.is_none();
+    if white <= 0.0 || (PLAUSIBLE_WHITE.contains(&white) && !unknown) {
         return 1.0;
     }
     *meas /= white;
@@ -309,8 +320,9 @@ fn rescale(mask: &Array3<f32>, meas: &mut Array3<f32>, truth: Option<&mut Truth>
     if let Some(mut x) = values.filter(|x| brightest_hundredth(x.iter().copied()).is_some_and(is_off)) {
         x /= white;
     }
+    let why = if unknown { "masks are in a unit of their own" } else { "measurements are off their scale" };
     warnings.push(format!(
-        "measurements are off their scale: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
+        "{why}: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
     ));
     white
 }
@@ -383,7 +395,7 @@ fn luma(video: Array4<f32>) -> Array4<f32> {
 pub fn read_mask(path: &Path, reading: &Reading) -> Result<(MaskStack, Vec<String>), SceneError> {
     let source = Source::open(path, None)?;
     let mut notes = Vec::new();
-    let masks = masks_of(&source, reading, &mut notes)?;
+    let (masks, _) = masks_of(&source, reading, &mut notes)?;
     let masks = MaskStack::new(masks).map_err(|e| SceneError::Mask {
         file: source.file,
         key: reading.keys.mask.clone(),
