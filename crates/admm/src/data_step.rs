@@ -165,13 +165,7 @@ impl DataStep<'_> {
         let of_all = Zip::from(&mut h).and(measurement.y()).and(&point);
         match momentum {
             Some(y1) => of_all.and(y1).for_each(|h, &y, &point, y1| {
-                *h = match level {
-                    Some(_) => difference(point, y, Some(y1), hold_momentum, level),
-                    None => {
-                        *y1 += if hold_momentum { 0.0 } else { y - point };
-                        *y1 - point
-                    }
-                };
+                *h = difference(point, y, Some(y1), hold_momentum, level);
             }),
             None => of_all.for_each(|h, &y, &point| *h = difference(point, y, None, hold_momentum, level)),
         }
@@ -429,10 +423,12 @@ fn one_sided_coefficients(
 /// `t − H p` of a pixel; what a clipped pixel asks for, and what it has asked for in y1 beyond y, is never negative: a constraint `H x ≥ y`
 /// and its multiplier.
 fn difference(point: f32, y: f32, y1: Option<&mut f32>, hold_momentum: bool, level: Option<f32>) -> f32 {
-    let one_sided = |v: f32| if level.is_some_and(|level| y >= level) { v.max(0.0) } else { v };
+    let clipped = level.is_some_and(|level| y >= level);
+    let one_sided = |v: f32| if clipped { v.max(0.0) } else { v };
     let Some(y1) = y1 else { return one_sided(y - point) };
     if !hold_momentum {
-        *y1 = y + one_sided(*y1 + (y - point) - y);
+        *y1 += y - point;
+        *y1 = if clipped { y1.max(y) } else { *y1 };
     }
     one_sided(*y1 - point)
 }

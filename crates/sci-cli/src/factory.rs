@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use admm::{Observer, Outcome, PerLattice, Plan, Prior, Start, StopRule, Tv};
+use admm::{Observer, Outcome, Plan, Prior, Start, StopRule, Tv};
 use ndarray::ArrayView3;
 use nets::kernels::{Isa, Precision};
 use online::{Reuse, Sequence, Task, Update, UpdateCounts};
@@ -122,8 +122,7 @@ impl<'e> Factory<'e> {
     /// The TV of a warm start, if the experiment begins with one.
     fn warm_start_prior(&self) -> Option<Box<dyn Prior>> {
         let solvers::Start::Tv { weight, .. } = self.experiment.solver.start else { return None };
-        let tv = Tv::new(weight);
-        Some(if self.color.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) })
+        Some(Tv::new(weight).on_sensor(self.color.as_ref().map(|sensor| sensor.cfa)))
     }
 
     fn run(

@@ -231,11 +231,10 @@ impl Measurement {
                 self.operator.forward(mosaic.view())
             }
         };
-        let mut y = self.y.clone();
-        if let (Some(y), Some(hx)) = (y.as_slice_mut(), residual.as_slice()) {
-            self.one_sided(y, hx);
+        residual -= &self.y;
+        if let Some(level) = self.clip {
+            residual.zip_mut_with(&self.y, |r, &y| *r = if y >= level { r.min(0.0) } else { *r });
         }
-        residual -= &y;
         close(residual.view_mut(), self.operator.gram());
         Ok(residual)
     }

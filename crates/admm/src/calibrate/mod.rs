@@ -11,7 +11,7 @@
 
 mod search;
 
-use crate::{Gap, PerLattice, Plan, Prior, SolveError, Stage, Start, Tv, run};
+use crate::{Gap, Plan, SolveError, Stage, Start, Tv, run};
 use ndarray::{Array2, ArrayView2, Zip};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -259,8 +259,7 @@ impl<'a> Judge<'a> {
     /// H x of the whole sensor, x solved without the pixels held out.
     fn predicted(&self, whole: &Measurement, stays: ArrayView2<'_, bool>) -> Result<Array2<f32>, CalibrateError> {
         let given = whole.restricted(stays)?;
-        let tv = Tv::new(TV_WEIGHT);
-        let prior: Box<dyn Prior> = if self.cfa.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) };
+        let prior = Tv::new(TV_WEIGHT).on_sensor(self.cfa);
         let plan = Plan::new([Stage { sigma: None, iterations: ITERATIONS }]);
         let outcome = run(&mut Gap::accelerated(prior), &given, Start::Mean, &plan, &mut ())?;
         Ok(whole.operator().forward(outcome.estimate.sensor.view()))

@@ -3,10 +3,7 @@
 
 use super::config::IteratesConfig;
 use crate::{Error, Result};
-use admm::{
-    BoxError, Call, Demosaicked, Denoiser, Flips, Gap, PerLattice, Plan, Prior, SolveError, Solver, Stage, Start, Tv,
-    run,
-};
+use admm::{BoxError, Call, Demosaicked, Denoiser, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start, Tv, run};
 use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use rand::{Rng, RngExt};
 use sci_forward::bayer::{Menon, mosaic_into};
@@ -19,8 +16,7 @@ const START_WEIGHT: f32 = 0.1;
 
 /// The prior of the start, for each sub-lattice of a color sensor.
 pub(super) fn start_prior(measurement: &Measurement) -> Box<dyn Prior> {
-    let tv = Tv::new(START_WEIGHT);
-    if measurement.cfa().is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) }
+    Tv::new(START_WEIGHT).on_sensor(measurement.cfa())
 }
 
 /// A call of the denoiser in a solve.

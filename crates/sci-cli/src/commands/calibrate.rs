@@ -7,8 +7,8 @@ use anyhow::{Context, anyhow};
 use ndarray::Axis;
 use plotters::prelude::*;
 
-use super::run::{choose, read_scene};
-use super::{Done, UsageError, catch_interrupts, interrupted};
+use super::run::scene_and_choice;
+use super::{Done, catch_interrupts, check_folder, interrupted};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
@@ -44,13 +44,9 @@ impl Args {
         let experiment = config::load(&self.config, &self.set)?;
         let default = || Path::new("runs").join(format!("{}-calibration", experiment.name));
         let out = self.out.clone().unwrap_or_else(default);
-        if out.exists() && !out.is_dir() {
-            return Err(UsageError(format!("--out {}: it is a file, expected a folder", out.display())).into());
-        }
+        check_folder(&out)?;
         catch_interrupts()?;
-        let scene = read_scene(&experiment).context("data.path")?;
-        scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
-        let chosen = choose(&experiment, &scene)?;
+        let (scene, chosen) = scene_and_choice(&experiment)?;
         let Self { reach, clock, .. } = self;
         let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };
         let found = match calibration::find(&scene, &chosen, &settings, interrupted) {

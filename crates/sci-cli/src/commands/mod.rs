@@ -149,6 +149,14 @@ fn catch_interrupts() -> anyhow::Result<()> {
     .context("cannot handle Ctrl-C")
 }
 
+/// Refuses a file where results are to have a folder.
+fn check_folder(out: &Path) -> Result<(), UsageError> {
+    if out.exists() && !out.is_dir() {
+        return Err(UsageError(format!("--out {}: it is a file, expected a folder", out.display())));
+    }
+    Ok(())
+}
+
 /// A size as `HEIGHTxWIDTH`.
 fn parse_size(text: &str) -> Result<(usize, usize), String> {
     let side = |s: &str| s.parse::<usize>().ok().filter(|n| (1..=65_535).contains(n));

@@ -11,7 +11,7 @@ use ndarray::Axis;
 use sci_forward::{Noise, VideoShape};
 use serde_json::json;
 
-use super::{Done, UsageError, catch_interrupts, interrupted};
+use super::{Done, UsageError, catch_interrupts, check_folder, interrupted};
 use crate::calibration::{self, Calibration};
 use crate::config::{self, Experiment, MaskSource, Simulate};
 use crate::factory::Factory;
@@ -50,14 +50,10 @@ impl Args {
         let begin = Instant::now();
         let experiment = config::load(&self.config, &self.set)?;
         let out = self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name));
-        if out.exists() && !out.is_dir() {
-            return Err(UsageError(format!("--out {}: it is a file, expected a folder", out.display())).into());
-        }
+        check_folder(&out)?;
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
-        let mut scene = read_scene(&experiment).context("data.path")?;
-        scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
-        let chosen = choose(&experiment, &scene)?;
+        let (mut scene, chosen) = scene_and_choice(&experiment)?;
         let calibration = match calibrate(&experiment, &mut scene, &chosen) {
             Err(_) if interrupted() => return Ok(Done::Interrupted),
             calibration => calibration?,
@@ -174,6 +170,14 @@ fn result_shape(scene: &Scene) -> [usize; 4] {
     [frames, if scene.cfa.is_some() { 3 } else { 1 }, height, width]
 }
 
+/// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted.
+pub(super) fn scene_and_choice(experiment: &Experiment) -> anyhow::Result<(Scene, Vec<usize>)> {
+    let scene = read_scene(experiment).context("data.path")?;
+    scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
+    let chosen = choose(experiment, &scene)?;
+    Ok((scene, chosen))
+}
+
 /// The scene that an experiment names, simulated if it says so.
 pub(super) fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
     let data = &experiment.data;
@@ -213,7 +217,7 @@ fn masks(
     })
 }
 
-pub(super) fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
+fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
     let count = scene.len();
     let chosen = experiment.data.measurements.clone().unwrap_or_else(|| (0..count).collect());
     match chosen.iter().find(|&&k| k >= count) {

@@ -1,6 +1,6 @@
 //! `kind = "tv"`: total variation.
 
-use admm::{Denoiser, PerLattice, Prior};
+use admm::{Denoiser, Prior};
 use serde_json::json;
 
 use super::{Built, Chosen, Entry, Part, Saving, Sensor, Site};
@@ -46,7 +46,6 @@ impl Built for Tv {
     }
 
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, _saving: &mut Saving) -> Box<dyn Prior + 'p> {
-        let tv = admm::Tv::new(self.weight).inner(self.inner);
-        if color.is_some() { Box::new(PerLattice::new(tv)) } else { Box::new(tv) }
+        admm::Tv::new(self.weight).inner(self.inner).on_sensor(color.map(|sensor| sensor.cfa))
     }
 }

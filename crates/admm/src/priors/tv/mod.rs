@@ -9,9 +9,10 @@ mod lanes;
 #[cfg(target_arch = "x86_64")]
 use self::lanes::{Avx2, Avx512};
 use self::lanes::{Lanes, MAX_LANES, Portable};
-use crate::{BoxError, Call, Denoiser};
+use crate::{BoxError, Call, Denoiser, PerLattice, Prior};
 use ndarray::parallel::prelude::*;
 use ndarray::{ArrayView2, ArrayView4, ArrayViewMut2, ArrayViewMut4, Axis};
+use sci_forward::CfaPattern;
 
 /// Dual step, 1 / (2 · dimensions).
 const TAU: f32 = 0.25;
@@ -105,6 +106,11 @@ impl Tv {
         assert!(weight > 0.0 && weight.is_normal(), "TV weight {weight} must be finite and greater than 1.2e-38");
         let sweep = Sweep::available()[0];
         Self { weight, inner: 5, sweep, scratch: Vec::new() }
+    }
+
+    /// The prior of a sensor's video: on a color sensor each of the four sub-lattices is a gray video.
+    pub fn on_sensor(self, cfa: Option<CfaPattern>) -> Box<dyn Prior> {
+        if cfa.is_some() { Box::new(PerLattice::new(self)) } else { Box::new(self) }
     }
 
     /// Iterations a call, at least 1.

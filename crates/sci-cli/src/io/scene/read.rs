@@ -168,13 +168,11 @@ fn normalised(mut mask: Array3<f32>) -> (Array3<f32>, bool) {
     if most <= MOST_TRANSMITTANCE {
         return (mask, false);
     }
-    let is_black_and_white = FULL_SCALES.contains(&most) && mask.iter().all(|&v| v == 0.0 || v == most);
+    let is_black_and_white =
+        scale::FULL_SCALES.iter().any(|&(_, full)| full == most) && mask.iter().all(|&v| v == 0.0 || v == most);
     mask /= most;
     (mask, !is_black_and_white)
 }
-
-/// White of pictures.
-const FULL_SCALES: [f32; 5] = [255.0, 1023.0, 4095.0, 16383.0, 65535.0];
 
 /// Gains of single frames may take a transmittance above 1.
 const MOST_TRANSMITTANCE: f32 = 2.0;

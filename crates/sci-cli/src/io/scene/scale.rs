@@ -10,7 +10,7 @@ use crate::io::samples::{Array, SampleType};
 use ndarray::{Array3, ArrayView3, Axis};
 
 /// White in numbers of 8, 10, 12, 14 and 16 bits.
-const FULL_SCALES: [(u32, f32); 5] = [(8, 255.0), (10, 1023.0), (12, 4095.0), (14, 16383.0), (16, 65535.0)];
+pub(super) const FULL_SCALES: [(u32, f32); 5] = [(8, 255.0), (10, 1023.0), (12, 4095.0), (14, 16383.0), (16, 65535.0)];
 /// Bright scenes and filters overshoot white a little.
 const OVERSHOOT: f32 = 2.0;
 /// Where the brightest hundredth of measurements lies, in units of a white that is to be believed.
