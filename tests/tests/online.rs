@@ -103,3 +103,49 @@ fn measurements_under_reset_are_single_runs_and_saved_weights_can_be_named() {
     let named = run(&bench, "named", &[weights, "online.enabled=false"]);
     assert_ne!(psnr(&named), psnr(&run(&bench, "plain", &["online.enabled=false"])));
 }
+
+/// `[online]` as `gray/adaptive.toml` has it, at the size of a test.
+const SPLIT: &str = "online={loss=\"split\",reuse=\"carry-over\",updates=4,every=2,crops=1,side=32,calls=2,learning_rate=1e-3,\
+                     judging=0.1,judged_crops=2,precision=\"f32\",save=true}";
+
+#[test]
+fn splitting_learns_once_from_all_measurements_before_the_first() {
+    let bench = bench();
+    let plain = run(&bench, "plain", &["online.enabled=false"]);
+    let adapted = run(&bench, "adapted", &[SPLIT]);
+    assert_ne!(psnr(&adapted), psnr(&plain));
+    let online = |k: usize| &adapted["measurements"][k]["online"];
+    let judgements = online(0)["split"]["judgements"].as_array().unwrap();
+    let updates: Vec<_> = judgements.iter().map(|j| j["updates"].as_u64().unwrap()).collect();
+    assert_eq!(updates, [0, 2, 4]);
+    assert_eq!((online(0)["counts"]["fired"].as_u64(), online(0)["split"]["kept"].as_u64()), (Some(4), Some(4)));
+    assert!(online(1)["split"].is_null() && online(2)["split"].is_null(), "learned once");
+
+    // What was learned is saved, and is all there is to it.
+    let weights = "denoiser.weights=adapted/adapted-0-ffdnet.safetensors";
+    assert_eq!(psnr(&run(&bench, "named", &[weights, "online.enabled=false"])), psnr(&adapted));
+
+    // Alone, a measurement is learned from alone.
+    let reset = run(&bench, "reset", &[SPLIT, "online.reuse=reset"]);
+    for k in 0..3 {
+        let alone = run(&bench, "alone", &[SPLIT, "online.reuse=reset", &format!("data.measurements=[{k}]")]);
+        assert_eq!(psnr(&alone)[0], psnr(&reset)[k], "measurement {k}");
+    }
+}
+
+#[test]
+fn splitting_wants_one_solve_to_learn_through() {
+    let bench = bench();
+    for (set, needle) in [
+        ("solver.kind=\"admm\"", "`solver.kind` is another"),
+        ("solver.momentum=\"zero\"", "`solver.momentum` is zero"),
+        ("solver.start=\"adjoint\"", "`solver.start` is another"),
+        ("denoiser={kind=\"tv\"}", "no network"),
+        ("stage=[{sigma=9,iterations=1},{denoiser={kind=\"tv\"},iterations=1}]", "`denoiser` is another"),
+        ("online.interval=2", "`online.interval` has no effect without online.loss"),
+    ] {
+        let run = bench.sci(&["run", "a.toml", "--out", "no", "--set", SPLIT, "--set", set]);
+        assert!(run.code == 2 && run.stderr.contains(needle), "{set}: {}", run.stderr);
+        assert!(!bench.path("no").exists());
+    }
+}

@@ -27,6 +27,7 @@ mod mixed_precision;
 mod network;
 pub mod train;
 mod unfolding;
+pub mod unrolled;
 mod video;
 pub mod weights;
 

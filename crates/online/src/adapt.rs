@@ -1,14 +1,15 @@
 //! The denoiser that updates its own network.
 
 use crate::{
-    AdaptConfig, Error, PixelSplit, Result, RollBackReason, SplitLoss, Update, UpdateCounts, UpdateOutcome,
-    accumulate_gradient,
+    AdaptConfig, AdaptLoss, Error, PixelSplit, Result, RollBackReason, SplitLoss, SplitRecord, Update, UpdateCounts,
+    UpdateOutcome, accumulate_gradient, adapt_by_splitting,
 };
 use admm::{BoxError, Call, Denoiser};
 use candle_core::{Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis};
 use nets::kernels::Precision;
 use nets::train::Adam;
+use nets::unrolled::Recipe;
 use nets::weights::{Storage, WeightFile, write_safetensors};
 use nets::{Network, SelectPrecision};
 use rand::{RngExt, SeedableRng};
@@ -16,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use sci_forward::Measurement;
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// A denoiser that adapts its network to the measurement that is being solved.
@@ -124,6 +126,26 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         Ok(())
     }
 
+    /// Under [`AdaptLoss::Split`]: [`adapt_by_splitting`] from the present weights, to measurements that are to be solved by `recipe`; under
+    /// the other loss nothing.
+    ///
+    /// # Errors
+    /// As [`adapt_by_splitting`].
+    pub fn adapt_by_splitting(
+        &mut self,
+        measurements: &[Measurement],
+        recipe: &Recipe,
+        watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
+    ) -> Result<Option<SplitRecord>>
+    where
+        N: Clone,
+    {
+        match &self.config.loss {
+            AdaptLoss::Measurement => Ok(None),
+            AdaptLoss::Split(split) => adapt_by_splitting(&mut self.net, measurements, recipe, split, watch).map(Some),
+        }
+    }
+
     /// The network with its present weights.
     pub fn network(&self) -> &N {
         &self.net
@@ -170,7 +192,9 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
 
     fn due(&self, iteration: usize) -> bool {
         let of_sequence = self.since_reset.saturating_sub(1);
-        self.measurements > 0 && self.config.schedule.due(iteration, of_sequence, self.fired)
+        self.config.loss == AdaptLoss::Measurement
+            && self.measurements > 0
+            && self.config.schedule.due(iteration, of_sequence, self.fired)
     }
 
     /// An update that is due: `out` is the output of the present weights for `noisy`, and becomes that of the new ones if they

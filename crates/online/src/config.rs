@@ -1,12 +1,24 @@
 //! The settings of an adaptive denoiser.
 
-use crate::{Error, Result, UpdateSchedule};
+use crate::{Error, Result, SplitConfig, UpdateSchedule};
 use nets::Parameters;
 use nets::kernels::Precision;
+
+/// What a denoiser learns from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum AdaptLoss {
+    /// How its output explains the measurement, while it solves: the paper's.
+    Measurement,
+    /// Pixels that trial solves are not given, before it solves: [`AdaptiveDenoiser::adapt_by_splitting`](crate::AdaptiveDenoiser::adapt_by_splitting).
+    /// The other settings have no effect.
+    Split(SplitConfig),
+}
 
 /// How a denoiser adapts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdaptConfig {
+    /// From what.
+    pub loss: AdaptLoss,
     /// When, and how far.
     pub schedule: UpdateSchedule,
     /// Which tensors change.
@@ -22,6 +34,7 @@ pub struct AdaptConfig {
 impl AdaptConfig {
     /// The paper's code with FFDNet: all parameters, no update is undone.
     pub const PAPER_FFDNET: Self = Self {
+        loss: AdaptLoss::Measurement,
         schedule: UpdateSchedule::PAPER_FFDNET,
         parameters: Parameters::All,
         roll_back: RollBackRule::OFF,
@@ -36,6 +49,9 @@ impl AdaptConfig {
     /// # Errors
     /// [`Error::Setting`] for the first that is out of range.
     pub fn validate(&self) -> Result<()> {
+        if let AdaptLoss::Split(split) = self.loss {
+            split.validate()?;
+        }
         self.schedule.validate()?;
         let RollBackRule { held_out, back_off, .. } = self.roll_back;
         if !(0.0..1.0).contains(&held_out) {

@@ -22,6 +22,11 @@ pub enum Error {
         /// The iteration, counted from 0.
         iteration: usize,
     },
+    /// No pixel that judges is open in any crop.
+    #[error(
+        "no pixel is left to judge adaptation by: the measurement is too small, or too few of its pixels are measured"
+    )]
+    NothingToJudge,
     /// A gray network for a color sensor, or the other way round.
     #[error("{network} has {found} channel(s); a {sensor} sensor needs {expected}")]
     Channels {

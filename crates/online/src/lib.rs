@@ -5,7 +5,8 @@
 //! `ℓ = mean (H T v − y)²`, the error of its own output v at the sensor, when its [`UpdateSchedule`] says so; an update is
 //! undone when pixels of the measurement that it did not see disagree ([`RollBackRule`]). It sees what the solver was given
 //! ([`admm::Call::measurement`]), so that pixels held out of the solve judge an adapted network as they judge any other prior.
-//! [`run_sequence`] solves the measurements of a scene in order.
+//! [`run_sequence`] solves the measurements of a scene in order. [`adapt_by_splitting`] learns before a solve instead, from pixels that trial
+//! solves were not given: what pays for networks that were trained for a solver's iterates.
 //!
 //! # Differences from the paper
 //! * Algorithm 2 lists the update at the end of iteration k, after w and u. It is done inside the v step here, as in the
@@ -25,9 +26,10 @@ mod record;
 mod reuse;
 mod schedule;
 mod sequence;
+mod split;
 
 pub use adapt::AdaptiveDenoiser;
-pub use config::{AdaptConfig, RollBackRule};
+pub use config::{AdaptConfig, AdaptLoss, RollBackRule};
 pub use error::Error;
 pub use loss::{PixelSplit, SplitLoss, accumulate_gradient};
 pub use nets::Parameters;
@@ -35,6 +37,7 @@ pub use record::{RollBackReason, Update, UpdateCounts, UpdateOutcome};
 pub use reuse::{Relation, Reuse, Similarity, continuation};
 pub use schedule::UpdateSchedule;
 pub use sequence::{Sequence, SequenceConfig, Solved, Task, run_sequence};
+pub use split::{Judgement, SplitConfig, SplitRecord, adapt_by_splitting};
 
 /// A result of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

@@ -1,12 +1,13 @@
 //! Owns the step from an experiment to objects that run: networks loaded once, solvers built for each measurement.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use admm::{Observer, Outcome, Plan, Prior, Start, StopRule, Tv};
 use ndarray::ArrayView3;
 use nets::kernels::{Isa, Precision};
-use online::{Reuse, Sequence, Task, Update, UpdateCounts};
+use online::{Reuse, Sequence, SplitRecord, Task, Update, UpdateCounts};
 use sci_forward::{CfaPattern, Measurement};
 
 use crate::config::{Experiment, Stage};
@@ -65,19 +66,20 @@ impl<'e> Factory<'e> {
         &self.plan
     }
 
-    /// Solves measurement `k`; `previous` is the result of the one before.
+    /// Solves the first of the measurements `left`; `previous` is the result of the one before.
     ///
     /// # Errors
     /// What [`admm::run`] and the adaptation report.
     pub fn solve(
         &mut self,
         scene: &Scene,
-        k: usize,
+        left: &[usize],
         previous: Option<ArrayView3<'_, f32>>,
-        observer: &mut dyn Observer,
+        observer: &mut dyn Follow,
     ) -> anyhow::Result<Solved> {
-        let measurement = scene.measurement(k)?;
+        let measurement = scene.measurement(left[0])?;
         let task = self.begin(&measurement)?;
+        let split = self.adapt_by_splitting(scene, left, task.as_ref(), observer)?;
         let done: Vec<usize> = self.learning().map(|(net, _)| net.updates().len()).collect();
         let plan = task.as_ref().map_or_else(|| self.plan.clone(), |task| task.plan(&self.plan));
         let mut warm = self.warm_start_prior();
@@ -104,9 +106,10 @@ impl<'e> Factory<'e> {
             relation: task.relation,
             warm_start: task.is_warm(),
             cut: task.cut,
-            counts: UpdateCounts::of(&updates),
+            counts: split.as_ref().map_or_else(|| UpdateCounts::of(&updates), counts_of),
             updates,
             updates_of,
+            split,
         });
         Ok(Solved { outcome, planned: plan.iterations(), work, adaptation })
     }
@@ -117,6 +120,32 @@ impl<'e> Factory<'e> {
         let task = sequence.begin(measurement.clone());
         self.learning().try_for_each(|(net, _)| net.prepare(&task))?;
         Ok(Some(task))
+    }
+
+    /// Lets networks learn before the solve, where they are to: what is carried over from all measurements that are left, once.
+    fn adapt_by_splitting(
+        &mut self,
+        scene: &Scene,
+        left: &[usize],
+        task: Option<&Task>,
+        observer: &mut dyn Follow,
+    ) -> anyhow::Result<Option<SplitRecord>> {
+        let Some(recipe) = &self.experiment.recipe else { return Ok(None) };
+        if !task.is_some_and(|task| task.fresh || task.index == 0) {
+            return Ok(None);
+        }
+        let used = if self.carries_over() { left } else { &left[..1] };
+        // What judges the solve is not learned from.
+        let given = |measurement| match &self.plan.hold_out {
+            Some(hold_out) => hold_out.given(&measurement),
+            None => measurement,
+        };
+        let measurements =
+            used.iter().map(|&k| Ok(given(scene.measurement(k)?))).collect::<anyhow::Result<Vec<_>>>()?;
+        let mut watch = |updates| observer.adaptation(updates);
+        let first = self.learning().next();
+        let record = first.map(|(net, _)| net.adapt_by_splitting(&measurements, recipe, &mut watch)).transpose()?;
+        Ok(record.flatten())
     }
 
     /// The TV of a warm start, if the experiment begins with one.
@@ -263,6 +292,17 @@ impl<'e> Factory<'e> {
             _ => "mixed",
         })
     }
+}
+
+/// What follows the solve of a measurement.
+pub trait Follow: Observer {
+    /// So many updates were made before it; whether to go on.
+    fn adaptation(&mut self, updates: usize) -> ControlFlow<()>;
+}
+
+fn counts_of(split: &SplitRecord) -> UpdateCounts {
+    let (fired, kept) = (split.updates(), split.kept);
+    UpdateCounts { fired, kept, rolled_back: fired - kept, skipped: 0 }
 }
 
 /// The outcome of one measurement, whatever the solver.

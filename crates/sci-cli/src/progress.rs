@@ -42,6 +42,16 @@ impl Progress {
         self.bar = Some(bar);
     }
 
+    /// Shows that a network was updated for the `done`-th time before the solve.
+    pub fn update(&mut self, done: usize) {
+        if stderr().is_terminal() {
+            eprint!("\r{}   update {done}   ", self.name);
+        } else if self.last_line.elapsed() >= LINE_EVERY {
+            self.last_line = Instant::now();
+            eprintln!("{}   update {done}", self.name);
+        }
+    }
+
     /// Shows that `done` iterations are done.
     pub fn step(&mut self, done: usize, psnr_db: Option<f64>) {
         let quality = psnr_db.map_or(String::new(), |p| format!("{p:.2} dB"));

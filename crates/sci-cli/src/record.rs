@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use online::{Relation, Update, UpdateCounts};
+use online::{Relation, SplitRecord, Update, UpdateCounts};
 use serde::{Deserialize, Serialize};
 
 use crate::io::{FileError, ReadError, read_file};
@@ -134,6 +134,9 @@ pub struct Adaptation {
     /// How many of them are of which network.
     #[serde(default)]
     pub updates_of: Vec<usize>,
+    /// What was learned before the solve, by measurement splitting.
+    #[serde(default)]
+    pub split: Option<SplitRecord>,
 }
 
 /// Why a solve ended; the same reasons as [`admm::StopReason`].

@@ -75,6 +75,11 @@ impl HoldOut {
         check("hold_out.overshoot", overshoot, "it must be greater than 0", overshoot > 0.0)
     }
 
+    /// What a solve is given of a measurement whose other pixels judge; all of it where there are too few to hold any out.
+    pub fn given(&self, full: &Measurement) -> Measurement {
+        HeldOut::new(full, self).map_or_else(|| full.clone(), |held_out| held_out.given)
+    }
+
     /// Which pixels of a sensor `[H, W]` stay in use: all but one in each block.
     fn draw(&self, image: (usize, usize)) -> Array2<bool> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);

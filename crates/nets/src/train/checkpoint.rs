@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 const KEY: &str = "checkpoint";
-const SCHEMA: u32 = 3;
+const SCHEMA: u32 = 4;
 
 /// What a checkpoint says beside its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,11 +21,21 @@ pub(super) struct Meta {
     pub(super) step: u64,
     pub(super) adam_steps: u64,
     pub(super) config: TrainConfig,
+    /// Solves in progress, in their order.
+    pub(super) pool: Vec<PoolMeta>,
+}
+
+/// What a solve in progress was drawn with, and the iterations that it has behind it and is to have.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct PoolMeta {
+    pub(super) seed: u64,
+    pub(super) done: usize,
+    pub(super) end: usize,
 }
 
 impl Meta {
-    pub(super) fn new(step: u64, adam_steps: u64, config: TrainConfig) -> Self {
-        Self { schema: SCHEMA, step, adam_steps, config }
+    pub(super) fn new(step: u64, adam_steps: u64, config: TrainConfig, pool: Vec<PoolMeta>) -> Self {
+        Self { schema: SCHEMA, step, adam_steps, config, pool }
     }
 }
 

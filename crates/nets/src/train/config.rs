@@ -4,6 +4,7 @@ use crate::kernels::Precision;
 use crate::video::Ends;
 use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, UnfoldingSpec};
 use candle_core::Tensor;
+use ndarray::Array4;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -82,7 +83,7 @@ pub enum NetworkConfig {
     Unfolding {
         /// 1 gray, 3 RGB.
         channels: usize,
-        /// Iterations, 1 to 32.
+        /// Iterations with weights of their own, 1 to 32; further ones have those of the last.
         iterations: usize,
         /// Channels at a half, a quarter and an eighth of the size, multiples of 16 up to 512.
         widths: [usize; 3],
@@ -227,8 +228,11 @@ pub struct SnapshotsConfig {
     pub density: [f64; 2],
     /// Kinds of masks, one drawn for each clip; a kind that is named twice comes twice as often.
     pub masks: Vec<MaskKind>,
-    /// Largest σ of the noise of y in 0..255 units, white and shot noise in any proportion; half of the clips have nearly none.
+    /// Largest σ of the noise of y in 0..255 units, white and shot noise in any proportion.
     pub noise: f32,
+    /// Share of the clips that have such noise; the others have nearly none. Default 0.5.
+    #[serde(default = "half")]
+    pub noisy: f64,
     /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. Default 0.
     #[serde(default)]
     pub holes: f64,
@@ -241,6 +245,11 @@ pub struct SnapshotsConfig {
     /// Iterations of TV that a solve starts from, 0 to 1000; 0 is y / Σ C. A solve with the network has to start alike. Default 0.
     #[serde(default)]
     pub start_iterations: usize,
+    /// Iterations of a solve, 1 to 64: more than the network has weights for are done with those of the last.
+    pub iterations: usize,
+    /// Iterations that one step does and learns from; the solve goes on from there in a later step. 1 to `iterations`: then each step does
+    /// whole solves.
+    pub at_once: usize,
 }
 
 /// How masks look.
@@ -294,6 +303,17 @@ impl Loss {
             Self::L2 => error.sqr()?,
         }
         .mean_all()
+    }
+
+    /// The mean over all values of an error, and its derivative by each.
+    pub(super) fn with_slope(self, error: Array4<f32>) -> (f32, Array4<f32>) {
+        let count = error.len().max(1) as f64;
+        let of = |e: f32| match self {
+            Self::L1 => (e.abs(), if e == 0.0 { 0.0 } else { e.signum() }),
+            Self::L2 => (e * e, 2.0 * e),
+        };
+        let sum: f64 = error.iter().map(|&e| f64::from(of(e).0)).sum();
+        ((sum / count) as f32, error.mapv(|e| of(e).1 / count as f32))
     }
 }
 
@@ -428,7 +448,8 @@ impl TrainConfig {
 
     fn validate_snapshots(&self, snapshots: &SnapshotsConfig) -> Result<()> {
         let SnapshotsConfig { frames: [few, many], density: [thin, dense], .. } = snapshots;
-        let SnapshotsConfig { masks, noise, holes, saturated, mask_errors, start_iterations, .. } = snapshots;
+        let SnapshotsConfig { masks, noise, noisy, holes, saturated, mask_errors, .. } = snapshots;
+        let SnapshotsConfig { start_iterations, iterations, at_once, .. } = snapshots;
         check(self.data.frames == 1, "data.frames", self.data.frames, "left out: snapshots.frames says how many")?;
         check(self.data.patch.is_multiple_of(8), "data.patch", self.data.patch, "a multiple of 8")?;
         let frames = (1..=64).contains(few) && (*few..=64).contains(many);
@@ -446,6 +467,10 @@ impl TrainConfig {
         check((0.0..=0.5).contains(holes), "snapshots.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(saturated), "snapshots.saturated", saturated, "0 to 1")?;
         check((0.0..=1.0).contains(mask_errors), "snapshots.mask_errors", mask_errors, "0 to 1")?;
+        check((0.0..=1.0).contains(noisy), "snapshots.noisy", noisy, "0 to 1")?;
+        check((1..=64).contains(iterations), "snapshots.iterations", iterations, "1 to 64")?;
+        let legal = "1 to snapshots.iterations";
+        check((1..=*iterations).contains(at_once), "snapshots.at_once", at_once, legal)?;
         check(*start_iterations <= 1000, "snapshots.start_iterations", start_iterations, "0 to 1000")
     }
 

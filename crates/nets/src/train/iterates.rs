@@ -2,13 +2,13 @@
 //! network as it is. An iterate is no clean video with white noise; its error has the structure of the masks.
 
 use super::config::IteratesConfig;
-use crate::{Error, Result};
-use admm::{BoxError, Call, Demosaicked, Denoiser, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start, Tv, run};
-use ndarray::{Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
+use crate::Result;
+use crate::unrolled::{Recipe, RecordedCall, unusable};
+use admm::{Denoiser, Prior, Tv};
+use ndarray::{Array2, Array3, ArrayView4, Axis};
 use rand::{Rng, RngExt};
-use sci_forward::bayer::{Menon, mosaic_into};
-use sci_forward::{CfaPattern, Demosaicer, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
-use std::fmt::Display;
+use sci_forward::bayer::mosaic_into;
+use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
 use std::sync::Arc;
 
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
@@ -17,14 +17,6 @@ const START_WEIGHT: f32 = 0.1;
 /// The prior of the start, for each sub-lattice of a color sensor.
 pub(super) fn start_prior(measurement: &Measurement) -> Box<dyn Prior> {
     Tv::new(START_WEIGHT).on_sensor(measurement.cfa())
-}
-
-/// A call of the denoiser in a solve.
-pub(super) struct RecordedCall {
-    /// What it is given, `[T, C, H, W]`, the right way round.
-    pub(super) input: Array4<f32>,
-    pub(super) sigma: f32,
-    pub(super) iteration: usize,
 }
 
 /// A measurement of a training clip.
@@ -81,7 +73,7 @@ impl Simulated {
     ) -> Result<Vec<RecordedCall>> {
         let mut calls = rand::seq::index::sample(rng, settings.sigmas.len(), settings.calls).into_vec();
         calls.sort_unstable();
-        self.record(settings, denoiser, calls)
+        settings.recipe().record(&self.measurement, denoiser, calls)
     }
 
     /// [`Self::iterates`] of consecutive calls; which is the last is drawn.
@@ -95,55 +87,19 @@ impl Simulated {
         rng: &mut impl Rng,
     ) -> Result<Vec<RecordedCall>> {
         let first = rng.random_range(0..=settings.sigmas.len() - settings.calls);
-        self.record(settings, denoiser, (first..first + settings.calls).collect())
+        settings.recipe().record(&self.measurement, denoiser, (first..first + settings.calls).collect())
     }
+}
 
-    /// The denoiser sees the video another way round in every call, as in the configurations that networks are trained for.
-    fn record(
-        &self,
-        settings: &IteratesConfig,
-        denoiser: &mut dyn Denoiser,
-        calls: Vec<usize>,
-    ) -> Result<Vec<RecordedCall>> {
-        let last = calls.last().copied().unwrap_or(0);
-        let mut recorder = Recorder { denoiser: Flips::new(denoiser), calls, seen: Vec::new() };
-        self.solve(&settings.sigmas[..=last], settings.start_iterations, &mut recorder)?;
-        Ok(recorder.seen)
-    }
-
-    /// Accelerated GAP from a few iterations of TV, or none of them the normalised measurement; one call of the denoiser for
-    /// each σ; the result is gray or RGB.
-    ///
-    /// # Errors
-    /// That of the network, if it is one of this crate.
-    pub(super) fn solve(
-        &self,
-        sigmas: &[f32],
-        start_iterations: usize,
-        denoiser: &mut dyn Denoiser,
-    ) -> Result<Array4<f32>> {
-        let stages: Vec<Stage> = sigmas.iter().map(|s| Stage { sigma: Some(s / 255.0), iterations: 1 }).collect();
-        let cfa = self.measurement.cfa();
-        let mut warm_up = start_prior(&self.measurement);
-        let start = match start_iterations {
-            0 => Start::Mean,
-            iterations => Start::Warm { prior: &mut *warm_up, stage: Stage { sigma: None, iterations } },
-        };
-        let mut solver: Box<dyn Solver + '_> = match cfa {
-            None => Box::new(Gap::accelerated(denoiser)),
-            Some(cfa) => Box::new(Gap::accelerated(Demosaicked::new(denoiser, Menon, cfa))),
-        };
-        let outcome = run(&mut *solver, &self.measurement, start, &Plan::new(stages), &mut ()).map_err(typed)?;
-        // The start, to which a divergence goes back, has no RGB video.
-        match (outcome.estimate.rgb, cfa) {
-            (Some(rgb), _) => Ok(rgb),
-            (None, None) => Ok(outcome.estimate.sensor.insert_axis(Axis(1))),
-            (None, Some(cfa)) => {
-                let (frames, height, width) = outcome.estimate.sensor.dim();
-                let mut rgb = Array4::zeros((frames, 3, height, width));
-                Menon.demosaic(cfa, outcome.estimate.sensor.view(), rgb.view_mut()).map_err(unusable)?;
-                Ok(rgb)
-            }
+impl IteratesConfig {
+    /// Accelerated GAP; the denoiser sees the video another way round in every call, as in the configurations that networks are trained
+    /// for.
+    pub(super) fn recipe(&self) -> Recipe {
+        Recipe {
+            sigmas: self.sigmas.iter().map(|s| s / 255.0).collect(),
+            accelerate: true,
+            start: (self.start_iterations > 0).then_some((self.start_iterations, START_WEIGHT)),
+            flips: true,
         }
     }
 }
@@ -159,53 +115,11 @@ fn random_masks(shape: VideoShape, settings: &IteratesConfig, rng: &mut impl Rng
     masks.map_err(unusable)
 }
 
-pub(super) fn unusable(error: impl Display) -> Error {
-    Error::Data(error.to_string())
-}
-
-/// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
-struct Recorder<'d> {
-    denoiser: Flips<&'d mut dyn Denoiser>,
-    calls: Vec<usize>,
-    seen: Vec<RecordedCall>,
-}
-
-impl Denoiser for Recorder<'_> {
-    fn name(&self) -> &str {
-        "recorder"
-    }
-
-    fn denoise(
-        &mut self,
-        call: &Call<'_>,
-        noisy: ArrayView4<'_, f32>,
-        mut out: ArrayViewMut4<'_, f32>,
-    ) -> std::result::Result<(), BoxError> {
-        if self.calls.contains(&call.iteration) {
-            let input = noisy.as_standard_layout().into_owned();
-            self.seen.push(RecordedCall { input, sigma: call.required_sigma()?, iteration: call.iteration });
-        }
-        if self.seen.len() == self.calls.len() {
-            out.assign(&noisy);
-            return Ok(());
-        }
-        self.denoiser.denoise(call, noisy, out)
-    }
-}
-
-/// The error of this crate that made a solver fail.
-pub(super) fn typed(error: SolveError) -> Error {
-    let text = error.to_string();
-    let source: Option<BoxError> = match error {
-        SolveError::Prior { source, .. } => Some(source),
-        _ => None,
-    };
-    source.and_then(|s| s.downcast::<Error>().ok()).map_or(Error::Data(text), |e| *e)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use admm::{BoxError, Call};
+    use ndarray::{Array4, ArrayViewMut4};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -245,7 +159,7 @@ mod tests {
                 Array4::from_shape_fn((2, channels, 8, 10), |(t, c, y, x)| ((t + 2 * c + y + x) % 7) as f32 / 7.0);
             let rng = &mut ChaCha8Rng::seed_from_u64(1);
             let simulated = Simulated::random(clip.view(), &settings, rng).unwrap();
-            let result = simulated.solve(&settings.sigmas, settings.start_iterations, &mut Broken).unwrap();
+            let result = settings.recipe().solve(simulated.measurement(), &mut Broken).unwrap();
             assert_eq!(result.dim(), clip.dim());
             assert!(result.iter().all(|v| v.is_finite()));
         }

@@ -10,10 +10,10 @@ mod data;
 mod iterates;
 mod muon;
 mod noise;
+mod pool;
 mod revive;
 mod snapshots;
 mod step;
-mod unrolled;
 
 pub use crate::kernels::Precision;
 pub use adam::Adam;

@@ -2,9 +2,9 @@
 //! its own, so that no single camera is learned by heart.
 
 use super::config::{Loss, MaskKind, SnapshotsConfig};
-use super::iterates::{start_prior, typed, unusable};
-use super::step::Gradients;
-use crate::unfolding::{Snapshot, UnfoldingNet, phases};
+use super::iterates::start_prior;
+use crate::unfolding::{Progress, Snapshot, UnfoldingNet, phases};
+use crate::unrolled::{Gradients, typed, unusable};
 use crate::{Error, Result};
 use admm::{Call, Estimate, Gap, Plan, Prior, PriorError, Stage, Start, run};
 use candle_core::{Tensor, Var};
@@ -24,11 +24,16 @@ const MOST_CLIPPED: f64 = 0.1;
 /// Noise of the clips that have nearly none, at most, in units of full scale.
 const NEARLY_NONE: f32 = 1.0 / 255.0;
 
-/// A clip and its measurement.
+/// A clip and its measurement, and how far its solve has come.
 pub(super) struct Exercise {
     snapshot: Snapshot,
     /// The frames as phases.
     clean: Tensor,
+    /// What it was drawn with.
+    pub(super) seed: u64,
+    pub(super) progress: Option<Progress>,
+    /// Iterations after which it is through.
+    pub(super) end: usize,
 }
 
 impl Exercise {
@@ -53,7 +58,8 @@ impl Exercise {
             Zip::from(&mut mask).and(&closed).for_each(|c, &closed| *c = if closed { 0.0 } else { *c });
         }
         let cfa = (clip.len_of(Axis(1)) == 3).then_some(CfaPattern::Rggb);
-        Ok(Self { snapshot: snapshot(told, y, cfa, settings.start_iterations)?, clean })
+        let snapshot = snapshot(told, y, cfa, settings.start_iterations)?;
+        Ok(Self { snapshot, clean, seed: 0, progress: None, end: settings.iterations })
     }
 
     /// A clip through binary masks of density ½, with white noise on the measurement: what networks are compared by.
@@ -68,11 +74,8 @@ impl Exercise {
         let mut y = (&masks * &seen).sum_axis(Axis(0));
         y.mapv_inplace(|y| y + sigma * normal(rng));
         let cfa = (clip.len_of(Axis(1)) == 3).then_some(CfaPattern::Rggb);
-        Ok(Self { snapshot: snapshot(masks, y, cfa, start_iterations)?, clean: clean_phases(clip)? })
-    }
-
-    pub(super) fn snapshot(&self) -> &Snapshot {
-        &self.snapshot
+        let snapshot = snapshot(masks, y, cfa, start_iterations)?;
+        Ok(Self { snapshot, clean: clean_phases(clip)?, seed: 0, progress: None, end: 0 })
     }
 
     /// Mean square error of each frame of a result.
@@ -80,10 +83,37 @@ impl Exercise {
         Ok((result - &self.clean)?.sqr()?.flatten_from(1)?.mean(1)?.to_vec1()?)
     }
 
-    /// The weighted mean loss of the results of all iterations, the k-th with weight k as the last is what a user gets, and its gradient for
-    /// each of `vars`.
-    pub(super) fn gradient(&self, net: &UnfoldingNet, vars: &[(String, Var)], loss: Loss) -> Result<Gradients> {
-        let results = net.unfold(&self.snapshot)?;
+    pub(super) fn drawn_with(self, seed: u64) -> Self {
+        Self { seed, ..self }
+    }
+
+    pub(super) fn ending(self, end: usize) -> Self {
+        Self { end, ..self }
+    }
+
+    pub(super) fn gone_on(self, progress: Option<Progress>) -> Self {
+        Self { progress, ..self }
+    }
+
+    pub(super) fn iterations_done(&self) -> usize {
+        self.progress.as_ref().map_or(0, |progress| progress.iterations)
+    }
+
+    /// The next `iterations` of the solve, as a graph.
+    pub(super) fn unfold(&self, net: &UnfoldingNet, iterations: usize) -> Result<(Vec<Tensor>, Tensor)> {
+        net.unfold(&self.snapshot, self.progress.as_ref(), iterations)
+    }
+
+    /// Goes on by `iterations`. Returns the weighted mean loss of their results, the k-th with weight k as the last is what a user gets, and
+    /// its gradient for each of `vars`; none goes back to iterations before these.
+    pub(super) fn advance(
+        &mut self,
+        net: &UnfoldingNet,
+        iterations: usize,
+        vars: &[(String, Var)],
+        loss: Loss,
+    ) -> Result<Gradients> {
+        let (results, features) = self.unfold(net, iterations)?;
         let weights = (results.len() * (results.len() + 1) / 2) as f64;
         let mut sum = Tensor::zeros((), self.clean.dtype(), self.clean.device())?;
         for (k, result) in results.iter().enumerate() {
@@ -91,6 +121,9 @@ impl Exercise {
         }
         let mut found = Gradients::zero(vars.len());
         found.add_found(sum.to_scalar()?, &sum.backward()?, vars)?;
+        let iterations = self.iterations_done() + results.len();
+        self.progress =
+            results.last().map(|result| Progress { iterations, result: result.detach(), features: features.detach() });
         Ok(found)
     }
 }
@@ -240,9 +273,13 @@ fn mistold(masks: &Array3<f32>, rng: &mut impl Rng) -> Array3<f32> {
     })
 }
 
-/// White and shot noise: half the time nearly none, else of any σ up to the largest, which is that of a pixel of average brightness.
+/// White and shot noise: in most clips nearly none, else of any σ up to the largest, which is that of a pixel of average brightness.
 fn add_noise(y: &mut Array2<f32>, settings: &SnapshotsConfig, rng: &mut impl Rng) {
-    let most = if rng.random::<bool>() { NEARLY_NONE.min(settings.noise / 255.0) } else { settings.noise / 255.0 };
+    let most = if rng.random::<f64>() >= settings.noisy {
+        NEARLY_NONE.min(settings.noise / 255.0)
+    } else {
+        settings.noise / 255.0
+    };
     let (sigma, shot) = (most * rng.random::<f32>(), rng.random::<f32>());
     let mean = y.mean().unwrap_or(0.0).max(f32::MIN_POSITIVE);
     y.mapv_inplace(|y| y + sigma * (1.0 - shot + shot * (y / mean).max(0.0)).sqrt() * normal(rng));
@@ -283,10 +320,13 @@ mod tests {
             density: [0.3, 0.6],
             masks: MaskKind::ALL.to_vec(),
             noise: 20.0,
+            noisy: 0.5,
             holes: 0.05,
             saturated: 0.5,
             mask_errors: 0.5,
             start_iterations: 2,
+            iterations: 3,
+            at_once: 3,
         }
     }
 
@@ -324,14 +364,14 @@ mod tests {
             let clip = Array4::from_shape_fn((t, channels, h, w), |(t, c, y, x)| {
                 ((7 * t + 5 * y + 3 * x + c) % 11) as f32 / 11.0
             });
-            let exercise = Exercise::new(clip.view(), &settings(), &mut ChaCha8Rng::seed_from_u64(2)).unwrap();
+            let exercise = || Exercise::new(clip.view(), &settings(), &mut ChaCha8Rng::seed_from_u64(2)).unwrap();
             let vars = crate::Layers::make_trainable(&mut net).unwrap();
             let mut rng = ChaCha8Rng::seed_from_u64(4);
             for (_, var) in &vars {
                 let values: Vec<f32> = (0..var.elem_count()).map(|_| 0.1 * normal(&mut rng)).collect();
                 var.set(&Tensor::from_vec(values, var.shape(), var.device()).unwrap()).unwrap();
             }
-            let found = exercise.gradient(&net, &vars, Loss::L2).unwrap();
+            let found = exercise().advance(&net, 3, &vars, Loss::L2).unwrap();
             let gradients: Vec<Vec<f32>> = found.of_vars.into_iter().map(Option::unwrap).collect();
             let norm = gradients.iter().flatten().map(|&g| f64::from(g).powi(2)).sum::<f64>().sqrt();
             let old: Vec<Vec<f32>> = vars.iter().map(|(_, v)| v.flatten_all().unwrap().to_vec1().unwrap()).collect();
@@ -340,7 +380,7 @@ mod tests {
                     let new: Vec<f32> = old.iter().zip(g).map(|(w, g)| w + (step / norm) as f32 * g).collect();
                     var.set(&Tensor::from_vec(new, var.shape(), var.device()).unwrap()).unwrap();
                 }
-                f64::from(exercise.gradient(&net, &vars, Loss::L2).unwrap().loss)
+                f64::from(exercise().advance(&net, 3, &vars, Loss::L2).unwrap().loss)
             };
             let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
             assert!((slope - norm).abs() < 0.02 * norm, "slope {slope}, gradient {norm}");

@@ -7,18 +7,17 @@ use super::config::{
     IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, SnapshotsConfig, TrainConfig, TrainingConfig,
 };
 use super::data::{TrainData, to_video};
-use super::iterates::{RecordedCall, Simulated};
+use super::iterates::Simulated;
 use super::noise::{add_noise, sensor};
+use super::pool::Pool;
 use super::revive::{Idle, State};
 use super::snapshots::{Exercise, cut};
-use super::unrolled::Unrolled;
-use crate::kernels::with_numbers;
 use crate::layers::Conv;
 use crate::unfolding::{MULTIPLE, UnfoldingNet};
+use crate::unrolled::{Gradients, RecordedCall, tensor};
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result};
-use admm::{Call, Denoiser, Flips};
-use candle_core::backprop::GradStore;
+use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
 use rand::{RngExt, SeedableRng};
@@ -153,48 +152,10 @@ struct Batch {
 enum Lesson {
     /// Noisy clips, or one iterate of a solver.
     Batch(Batch),
-    /// Some iterations of a solver.
-    Unrolled(Box<Unrolled>),
-    /// The whole solve of a measurement.
+    /// Consecutive calls of a solver, and the truth.
+    Unrolled { simulated: Box<Simulated>, clean: Array4<f32>, calls: Vec<RecordedCall> },
+    /// Some iterations of the solve of a measurement.
     Exercise(Box<Exercise>),
-}
-
-/// A loss, and its gradient for each variable (nothing for those it does not depend on).
-pub(super) struct Gradients {
-    pub loss: f32,
-    pub of_vars: Vec<Option<Vec<f32>>>,
-}
-
-impl Gradients {
-    pub(super) fn zero(vars: usize) -> Self {
-        Self { loss: 0.0, of_vars: vec![None; vars] }
-    }
-
-    /// Adds `share` times another.
-    fn add(&mut self, other: Self, share: f32) {
-        self.loss += share * other.loss;
-        for (sum, gradient) in self.of_vars.iter_mut().zip(other.of_vars) {
-            let Some(gradient) = gradient else { continue };
-            let sum = sum.get_or_insert_with(|| vec![0.0; gradient.len()]);
-            sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * g);
-        }
-    }
-
-    /// Adds a loss and what was found to be its gradient.
-    pub(super) fn add_found(&mut self, loss: f32, found: &GradStore, vars: &[(String, Var)]) -> Result<()> {
-        self.loss += loss;
-        for (sum, (_, var)) in self.of_vars.iter_mut().zip(vars) {
-            match (sum, found.get(var)) {
-                (_, None) => {}
-                (none @ None, Some(gradient)) => *none = Some(gradient.flatten_all()?.to_vec1()?),
-                (Some(sum), Some(gradient)) => with_numbers(gradient, |gradient| {
-                    sum.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += g);
-                    Ok(())
-                })?,
-            }
-        }
-        Ok(())
-    }
 }
 
 /// One training run.
@@ -225,6 +186,8 @@ pub struct Trainer {
     adam: Adam,
     average: Vec<Vec<f32>>,
     idle: Idle,
+    /// Of an unfolding network.
+    pool: Pool,
     /// Whether it began with random weights.
     random: bool,
     step: u64,
@@ -283,7 +246,7 @@ impl Trainer {
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         let idle = Idle::new(&model.layers().convs(), &vars);
-        Ok(Self { config, data, model, vars, adam, average, idle, random: true, step: 0 })
+        Ok(Self { config, data, model, vars, adam, average, idle, pool: Pool::default(), random: true, step: 0 })
     }
 
     /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
@@ -369,12 +332,12 @@ impl Trainer {
             let frames = rng.random_range(few..=many);
             let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
             let simulated = Simulated::random(clip.view(), settings, &mut rng)?;
-            let clean = stack(&[clip])?;
             let mut model = model.clone();
             if settings.unrolled {
                 let calls = simulated.last_calls(settings, &mut model, &mut rng)?;
-                return Ok(vec![Lesson::Unrolled(Box::new(Unrolled { simulated, clean, calls }))]);
+                return Ok(vec![Lesson::Unrolled { simulated: Box::new(simulated), clean: clip, calls }]);
             }
+            let clean = stack(&[clip])?;
             let calls = simulated.iterates(settings, &mut model, &mut rng)?;
             let lesson = |RecordedCall { input, sigma, .. }| {
                 Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(input)?, sigmas: vec![sigma] }))
@@ -385,17 +348,22 @@ impl Trainer {
         Ok(clips.into_iter().flatten().collect())
     }
 
-    /// Clips measured by simulated cameras, each a lesson of its own as they differ in length.
-    fn exercises(&self, settings: &SnapshotsConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
+    /// A clip measured by a simulated camera.
+    fn exercise(&self, settings: &SnapshotsConfig, seed: u64) -> Result<Exercise> {
+        let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
+        let [few, many] = settings.frames;
+        let frames = rng.random_range(few..=many);
+        let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
+        Ok(Exercise::new(clip.view(), settings, &mut rng)?.drawn_with(seed))
+    }
+
+    /// Solves to go on with, each a lesson of its own as clips differ in length.
+    fn exercises(&mut self, settings: &SnapshotsConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
-        let exercise = |seed: u64| {
-            let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
-            let [few, many] = settings.frames;
-            let frames = rng.random_range(few..=many);
-            let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
-            Ok(Lesson::Exercise(Box::new(Exercise::new(clip.view(), settings, &mut rng)?)))
-        };
-        seeds.into_par_iter().map(exercise).collect()
+        let mut pool = std::mem::take(&mut self.pool);
+        let solves = pool.take(settings, &seeds, |seed| self.exercise(settings, seed));
+        self.pool = pool;
+        Ok(solves?.into_iter().map(|solve| Lesson::Exercise(Box::new(solve))).collect())
     }
 
     /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves.
@@ -409,9 +377,9 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.config.learning_rate(self.step);
-        let lessons = match (&self.config.iterates, &self.config.snapshots) {
+        let mut lessons = match (&self.config.iterates, &self.config.snapshots) {
             (Some(iterates), _) => self.iterates(iterates, &mut rng)?,
-            (_, Some(snapshots)) => self.exercises(snapshots, &mut rng)?,
+            (_, Some(snapshots)) => self.exercises(&snapshots.clone(), &mut rng)?,
             _ => {
                 let noise = self.config.noise.clone().expect("validated: noise, iterates or snapshots");
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
@@ -423,7 +391,11 @@ impl Trainer {
         if self.config.training.optimizer == Optimizer::Muon && self.step.is_multiple_of(CENTRE_EVERY) {
             self.find_centres(&lessons[0])?;
         }
-        let Gradients { loss, of_vars } = self.gradients(&lessons)?;
+        let Gradients { loss, of_vars } = self.gradients(&mut lessons)?;
+        self.pool.put_back(lessons.into_iter().filter_map(|lesson| match lesson {
+            Lesson::Exercise(solve) => Some(*solve),
+            _ => None,
+        }));
         let diverged = Error::Diverged { step: self.step + 1, loss };
         if !loss.is_finite() {
             return Err(diverged);
@@ -486,13 +458,18 @@ impl Trainer {
         watched.layers_mut().convs_mut().into_iter().for_each(Conv::watch);
         match lesson {
             Lesson::Batch(Batch { seen, sigmas, .. }) => drop(watched.network()?.forward(seen, sigmas)?),
-            Lesson::Unrolled(unrolled) => {
-                let first = &unrolled.calls[0];
+            Lesson::Unrolled { calls, .. } => {
+                let first = &calls[0];
                 drop(watched.network()?.forward(&tensor(first.input.clone())?, &[first.sigma])?);
             }
-            Lesson::Exercise(exercise) => drop(watched.unfolding()?.unfold(exercise.snapshot())?),
+            Lesson::Exercise(exercise) => drop(exercise.unfold(watched.unfolding()?, self.at_once())?),
         }
         Ok(watched)
+    }
+
+    /// Iterations of a solve that a step does.
+    fn at_once(&self) -> usize {
+        self.config.snapshots.as_ref().map_or(1, |snapshots| snapshots.at_once)
     }
 
     /// Lets channels that were idle for long begin anew, while there is time for them to learn.
@@ -506,19 +483,19 @@ impl Trainer {
     }
 
     /// The mean loss of the lessons, and its gradient.
-    fn gradients(&self, lessons: &[Lesson]) -> Result<Gradients> {
-        let parts = lessons.par_iter().map(|lesson| self.gradient(lesson)).collect::<Result<Vec<_>>>()?;
-        let mut mean = Gradients::zero(self.vars.len());
-        let share = 1.0 / lessons.len() as f32;
-        parts.into_iter().for_each(|part| mean.add(part, share));
-        Ok(mean)
+    fn gradients(&self, lessons: &mut [Lesson]) -> Result<Gradients> {
+        Ok(Gradients::mean(lessons.par_iter_mut().map(|lesson| self.gradient(lesson)).collect::<Result<_>>()?))
     }
 
-    fn gradient(&self, lesson: &Lesson) -> Result<Gradients> {
+    fn gradient(&self, lesson: &mut Lesson) -> Result<Gradients> {
         let loss = self.config.training.loss;
         match lesson {
-            Lesson::Unrolled(unrolled) => unrolled.gradient(self.model.network()?, &self.vars, loss),
-            Lesson::Exercise(exercise) => exercise.gradient(self.model.unfolding()?, &self.vars, loss),
+            Lesson::Unrolled { simulated, clean, calls } => {
+                let of_clean = |v: ArrayView4<'_, f32>| Ok(loss.with_slope(&v - &*clean));
+                let recipe = self.config.iterates.as_ref().expect("these lessons come of iterates").recipe();
+                recipe.gradient(simulated.measurement(), calls, self.model.network()?, &self.vars, &of_clean)
+            }
+            Lesson::Exercise(exercise) => exercise.advance(self.model.unfolding()?, self.at_once(), &self.vars, loss),
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
                 let loss = loss.mean(&(self.model.network()?.forward(seen, sigmas)? - clean)?)?;
                 let mut found = Gradients::zero(self.vars.len());
@@ -599,8 +576,7 @@ impl Trainer {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
             let simulated = Simulated::random(clean.view(), settings, &mut rng)?;
-            let restored =
-                simulated.solve(&settings.sigmas, settings.start_iterations, &mut Flips::new(&mut *model))?;
+            let restored = settings.recipe().solve(simulated.measurement(), model)?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;
@@ -612,12 +588,13 @@ impl Trainer {
     /// PSNR of the solves of the middle of each held-out clip, without noise on the measurement or with that of a level in 0..255 units.
     fn score_solves(&self, net: &UnfoldingNet, sigma: Option<f32>) -> Result<Score> {
         let mut psnrs = Vec::new();
-        let start_iterations = self.config.snapshots.as_ref().map_or(0, |snapshots| snapshots.start_iterations);
+        let settings = self.config.snapshots.as_ref();
+        let (start_iterations, iterations) = settings.map_or((0, 1), |s| (s.start_iterations, s.iterations));
         for (i, clip) in self.data.validation.iter().enumerate() {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = cut(&centre(&to_video(clip, VALIDATION_FRAMES)), MULTIPLE);
             let exercise = Exercise::plain(clean.view(), sigma.unwrap_or(0.0) / 255.0, start_iterations, &mut rng)?;
-            let results = net.unfold(exercise.snapshot())?;
+            let (results, _) = exercise.unfold(net, iterations)?;
             let errors = results.last().map(|last| exercise.errors(last)).transpose()?.unwrap_or_default();
             psnrs.extend(errors.into_iter().map(|error| -10.0 * f64::from(error).log10()));
         }
@@ -656,7 +633,8 @@ impl Trainer {
         for (weight, Centre { means, .. }) in self.adam.centres() {
             tensors.insert(format!("means/{}", self.vars[weight].0), Tensor::new(&**means, &Device::Cpu)?);
         }
-        checkpoint::write(path, &Meta::new(self.step, self.adam.steps(), self.config.clone()), &tensors)
+        let pool = self.pool.state(&mut tensors);
+        checkpoint::write(path, &Meta::new(self.step, self.adam.steps(), self.config.clone(), pool), &tensors)
     }
 
     /// Continues from a checkpoint, or from the one before it when the newest is damaged.
@@ -700,7 +678,12 @@ impl Trainer {
             let Some(inputs) = self.adam.centred_inputs(weight) else { continue };
             centres.push((weight, Centre { bias, means: take("means", &self.vars[weight].0, &[inputs])? }));
         }
+        let pool = match &self.config.snapshots {
+            Some(snapshots) => Pool::restored(path, &meta.pool, &mut tensors, |seed| self.exercise(snapshots, seed))?,
+            None => Pool::default(),
+        };
         // Only now that all is there does anything change.
+        self.pool = pool;
         for ((_, var), weights) in self.vars.iter().zip(weights) {
             var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
         }
@@ -726,14 +709,9 @@ fn centre(video: &Array4<f32>) -> Array4<f32> {
 }
 
 /// Clips of equal shape, one after another.
-pub(super) fn stack(clips: &[Array4<f32>]) -> Result<Tensor> {
+fn stack(clips: &[Array4<f32>]) -> Result<Tensor> {
     let views: Vec<_> = clips.iter().map(|clip| clip.view()).collect();
     tensor(concatenate(Axis(0), &views).map_err(|e| Error::Data(e.to_string()))?)
-}
-
-pub(super) fn tensor(video: Array4<f32>) -> Result<Tensor> {
-    let shape = video.dim();
-    Ok(Tensor::from_iter(video, &Device::Cpu)?.reshape(shape)?)
 }
 
 /// Over all channels of a frame.

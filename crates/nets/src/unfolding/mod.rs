@@ -56,7 +56,7 @@ const SITES: [usize; PHASES] = [0, 5, 6, 11];
 pub struct UnfoldingSpec {
     /// Colors of a frame: 1, or 3 for an RGB video behind a Bayer sensor.
     pub channels: usize,
-    /// Iterations, each with weights of its own: 1 to 32.
+    /// Iterations with weights of their own, 1 to 32; all further ones have those of the last.
     pub iterations: usize,
     /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
     pub widths: [usize; LEVELS],
@@ -267,22 +267,36 @@ impl UnfoldingNet {
         self.spec
     }
 
-    /// The solve as a differentiable function of the weights: the result of each iteration, all as phases `[T, 4 C, H/2, W/2]`.
-    pub(crate) fn unfold(&self, snapshot: &Snapshot) -> Result<Vec<Tensor>> {
+    /// `iterations` of the solve as a differentiable function of the weights, from `progress` on: the result of each, all as phases
+    /// `[T, 4 C, H/2, W/2]`, and the features of the last.
+    pub(crate) fn unfold(
+        &self,
+        snapshot: &Snapshot,
+        progress: Option<&Progress>,
+        iterations: usize,
+    ) -> Result<(Vec<Tensor>, Tensor)> {
         let mut results: Vec<Tensor> = Vec::new();
-        let (mut x, mut sensor, mut features) = (snapshot.start.clone(), snapshot.mean.clone(), None);
-        for k in 0..self.spec.iterations {
-            let base = self.base(&x, results.last())?;
-            let changed = (&x - &sensor)?;
-            let shown = Tensor::cat(&[&(&base - f64::from(GRAY))?, &changed, &snapshot.beside], 1)?;
-            let (found, h) = self.iteration(k, &shown, features.take())?;
+        let mut before = progress.map(|p| p.result.clone());
+        let mut features = progress.map(|p| p.features.clone());
+        let first = progress.map_or(0, |p| p.iterations);
+        for k in first..first + iterations.max(1) {
+            let (x, sensor) = match &before {
+                None => (snapshot.start.clone(), snapshot.mean.clone()),
+                Some(v) => {
+                    let sensor = self.sensor(v)?;
+                    (snapshot.project(&sensor)?, sensor)
+                }
+            };
+            let base = self.base(&x, before.as_ref())?;
+            let shown = Tensor::cat(&[&(&base - f64::from(GRAY))?, &(&x - &sensor)?, &snapshot.beside], 1)?;
+            let (found, h) = self.iteration(k.min(self.spec.iterations - 1), &shown, features.take())?;
             let v = (base + found)?;
-            sensor = self.sensor(&v)?;
-            x = snapshot.project(&sensor)?;
+            before = Some(v.clone());
             features = Some(h);
             results.push(v);
         }
-        Ok(results)
+        let features = features.ok_or_else(|| Error::Data("a solve of no iterations".to_owned()))?;
+        Ok((results, features))
     }
 
     /// One call of the network: what it adds to the estimate, and the features for the next.
@@ -727,6 +741,16 @@ fn add(image: &mut Blocked, other: &Blocked) {
             row.as_flattened_mut().iter_mut().zip(other.row(block, y)).for_each(|(sum, value)| *sum += value);
         });
     }
+}
+
+/// How far a solve of [`UnfoldingNet::unfold`] has come.
+pub(crate) struct Progress {
+    /// Iterations done, at least one.
+    pub(crate) iterations: usize,
+    /// The last result, without a graph behind it.
+    pub(crate) result: Tensor,
+    /// The features of that iteration, likewise.
+    pub(crate) features: Tensor,
 }
 
 /// A measurement for [`UnfoldingNet::unfold`], all images as phases `[T or 1, 4, H/2, W/2]`.

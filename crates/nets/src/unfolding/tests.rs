@@ -69,7 +69,7 @@ fn inference_is_the_differentiable_solve() {
     for (channels, frames) in [(1, 5), (3, 3), (1, 1)] {
         let mut net = loud(UnfoldingSpec { channels, ..SPEC });
         let (masks, y) = measured((frames, 16, 24));
-        let results = net.unfold(&snapshot(&masks, &y)).unwrap();
+        let results = net.unfold(&snapshot(&masks, &y), None, 2).unwrap().0;
         let found = solved(&mut net, &masks, &y, (channels == 3).then_some(CfaPattern::Rggb));
         let found = Tensor::from_iter(found.iter().copied(), &Device::Cpu).unwrap().reshape(found.dim()).unwrap();
         let expected = pixel_shuffle(results.last().unwrap(), 2).unwrap();
@@ -108,7 +108,7 @@ fn an_untrained_network_projects() {
     let net = UnfoldingNet::random(SPEC, 1).unwrap();
     let (masks, y) = measured((4, 8, 8));
     let snapshot = snapshot(&masks, &y);
-    let results = net.unfold(&snapshot).unwrap();
+    let results = net.unfold(&snapshot, None, 2).unwrap().0;
     let change = (results.last().unwrap() - &snapshot.start).unwrap().abs().unwrap().max_all().unwrap();
     assert!(change.to_scalar::<f32>().unwrap() < 1e-5);
 }
@@ -119,7 +119,7 @@ fn the_scale_of_masks_and_measurement_does_not_matter() {
     let (masks, y) = measured((3, 8, 8));
     let last = |scale: f32| {
         let snapshot = snapshot(&(&masks * scale), &(&y * scale));
-        net.unfold(&snapshot).unwrap().pop().unwrap()
+        net.unfold(&snapshot, None, 2).unwrap().0.pop().unwrap()
     };
     let change = (last(1.0) - last(100.0)).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
     assert!(change < 1e-4, "{change}");
@@ -136,7 +136,7 @@ fn gradients_are_slopes() {
         let g: Vec<Tensor> = (0..2).map(|_| random(&[3, 4 * channels, 4, 8], &mut rng)).collect();
         let vars = net.make_trainable().unwrap();
         let directions: Vec<Tensor> = vars.iter().map(|(_, var)| random(var.dims(), &mut rng)).collect();
-        let results = net.unfold(&snapshot).unwrap();
+        let results = net.unfold(&snapshot, None, 2).unwrap().0;
         let sum = ((&results[0] * &g[0]).unwrap() + (&results[1] * &g[1]).unwrap()).unwrap().sum_all().unwrap();
         let grads = sum.backward().unwrap();
         let double = |t: &Tensor| t.detach().to_dtype(DType::F64).unwrap();
@@ -151,7 +151,7 @@ fn gradients_are_slopes() {
                     *tensor = (double(tensor) + (double(directions.next().unwrap()) * step).unwrap()).unwrap();
                 }
             }
-            let results = net.unfold(&snapshot.to_dtype(DType::F64)).unwrap();
+            let results = net.unfold(&snapshot.to_dtype(DType::F64), None, 2).unwrap().0;
             dot(&results[0], &g[0]) + dot(&results[1], &g[1])
         };
         let difference = (moved(1e-8) - moved(-1e-8)) / 2e-8;

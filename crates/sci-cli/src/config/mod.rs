@@ -12,10 +12,12 @@ mod stage;
 
 use std::path::Path;
 
+use ::online::AdaptLoss;
+use nets::unrolled::Recipe;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::parts::{Around, Chosen, Misfit, first_of_all};
+use crate::parts::{Around, Chosen, Demosaicer, Misfit, first_of_all};
 use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
 
@@ -47,8 +49,10 @@ pub struct Experiment {
     pub seconds: Option<f64>,
     /// What is left out, if anything may be.
     pub skip: Option<Skip>,
-    /// How networks adapt while they solve, if they do.
+    /// How networks adapt, if they do.
     pub online: Option<Online>,
+    /// The solve that they learn through, where they do so before it.
+    pub recipe: Option<Recipe>,
     /// What to write.
     pub output: Output,
     /// The keys of its tables, defaults filled in.
@@ -181,12 +185,14 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         seconds,
         skip,
         online,
+        recipe: None,
         output,
         json,
         written,
     };
     experiment
         .check_denoisers()
+        .and_then(|()| experiment.set_recipe())
         .map_err(|Misfit { key, problem }| source.error_at(key, format!("`{key}` {problem}")))?;
     experiment.begin_with_tv();
     Ok(experiment)
@@ -232,6 +238,49 @@ impl Experiment {
                 tiles: self.skip.is_some_and(|s| s.tiles),
             })
         })
+    }
+
+    /// For measurement splitting, the solve to learn through.
+    fn set_recipe(&mut self) -> Result<(), Misfit> {
+        if !self.online.is_some_and(|online| matches!(online.adapt.loss, AdaptLoss::Split(_))) {
+            return Ok(());
+        }
+        let start = match self.solver.start {
+            Start::Mean => Some(None),
+            Start::Tv { iterations, weight } => Some(Some((iterations, weight))),
+            Start::Adjoint | Start::Previous => None,
+        };
+        let first = self.stages.first().map_or(0, |stage| stage.denoiser);
+        let part = &self.denoisers[first].part;
+        let alone = self.stages.iter().all(|stage| stage.denoiser == first) && part.adapts();
+        let accelerate = self.solver.method.unrolled();
+        let through = "but online.loss = \"split\" learns through";
+        let rules = [
+            (self.solver.kind == "gap", "solver.kind", format!("is another, {through} GAP; legal: gap")),
+            (
+                accelerate.is_some(),
+                "solver.momentum",
+                format!("is zero, {through} momentum from y; legal: measurement, or solver.accelerate = false"),
+            ),
+            (start.is_some(), "solver.start", format!("is another, {through} solves from these; legal: mean, tv")),
+            (
+                self.solver.demosaicer() == Demosaicer::Menon,
+                "solver.demosaicer",
+                format!("is another, {through} Menon's; legal: menon"),
+            ),
+            (alone, "denoiser", format!("is another, {through} one ffdnet or fastdvdnet in all stages; legal: that")),
+        ];
+        if let Some((_, key, problem)) = rules.into_iter().find(|(holds, ..)| !holds) {
+            return Err(Misfit { key, problem });
+        }
+        let sigma = |stage: &Stage| std::iter::repeat_n(stage.sigma.unwrap_or(0.0), stage.iterations);
+        self.recipe = accelerate.zip(start).map(|(accelerate, start)| Recipe {
+            sigmas: self.stages.iter().flat_map(sigma).collect(),
+            accelerate,
+            start,
+            flips: part.network().is_some_and(|network| network.flips),
+        });
+        Ok(())
     }
 
     /// Where `[skip]` may, lets TV go first where a network would that is told a σ: as a stage of its own from the mean, for as

@@ -10,11 +10,13 @@ mod unfolding;
 mod wnnm;
 
 use std::fmt::Debug;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 use admm::{Demosaicked, Denoiser, Prior};
-use online::{AdaptConfig, Task, Update};
-use sci_forward::CfaPattern;
+use nets::unrolled::Recipe;
+use online::{AdaptConfig, SplitRecord, Task, Update};
+use sci_forward::{CfaPattern, Measurement};
 use serde_json::Value;
 
 use crate::table::{ConfigError, Table};
@@ -178,6 +180,17 @@ pub trait Learning {
     /// # Errors
     /// As [`Task::prepare`].
     fn prepare(&mut self, task: &Task) -> online::Result<()>;
+
+    /// Learns before a solve by `recipe`, where it is to; `watch` is told of each update and says whether to go on.
+    ///
+    /// # Errors
+    /// As [`online::adapt_by_splitting`].
+    fn adapt_by_splitting(
+        &mut self,
+        measurements: &[Measurement],
+        recipe: &Recipe,
+        watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
+    ) -> online::Result<Option<SplitRecord>>;
 
     /// Writes its weights as they are now.
     ///

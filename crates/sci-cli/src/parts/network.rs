@@ -1,12 +1,15 @@
 //! What the networks share: keys, and how those that denoise white noise run and learn.
 
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use admm::{Denoiser, Prior};
 use nets::Network;
 use nets::kernels::Precision;
+use nets::unrolled::Recipe;
 use nets::weights::bundled_for_iterates;
-use online::{AdaptiveDenoiser, Task, Update};
+use online::{AdaptiveDenoiser, SplitRecord, Task, Update};
+use sci_forward::Measurement;
 
 use super::{Built, Learning, Saving, Sensor, Site, demosaicked};
 use crate::table::Table;
@@ -46,7 +49,7 @@ impl Inference {
     /// Makes a loaded network ready to run, and to learn.
     pub(super) fn build<N>(&self, mut net: N, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>>
     where
-        N: Network + Denoiser + 'static,
+        N: Network + Denoiser + Clone + 'static,
     {
         site.fits(net.channels(), &self.weights)?;
         net.set_inference_precision(self.precision);
@@ -63,7 +66,7 @@ struct Running<N> {
     multiply_adds: f64,
 }
 
-impl<N: Network + Denoiser> Built for Running<N> {
+impl<N: Network + Denoiser + Clone> Built for Running<N> {
     fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>> {
         Some(saving.network(&mut self.net, &self.inference, self.multiply_adds))
     }
@@ -77,9 +80,18 @@ impl<N: Network + Denoiser> Built for Running<N> {
     }
 }
 
-impl<N: Network + Denoiser> Learning for AdaptiveDenoiser<N> {
+impl<N: Network + Denoiser + Clone> Learning for AdaptiveDenoiser<N> {
     fn prepare(&mut self, task: &Task) -> online::Result<()> {
         task.prepare(self)
+    }
+
+    fn adapt_by_splitting(
+        &mut self,
+        measurements: &[Measurement],
+        recipe: &Recipe,
+        watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
+    ) -> online::Result<Option<SplitRecord>> {
+        AdaptiveDenoiser::adapt_by_splitting(self, measurements, recipe, watch)
     }
 
     fn save(&mut self, path: &Path) -> online::Result<()> {

@@ -303,6 +303,12 @@ function viewer(r, images) {
   if (wish.has("frame")) { slider.value = wish.get("frame"); slider.dispatchEvent(new Event("input")); }
   if (wish.has("play")) play.click();
 }
+/** What networks learned before a solve: how well they predict pixels that trial solves were not given. */
+function adaptation(measurements) {
+  if (!measurements.length) return;
+  table(section("Adaptation"), ["measurement", "updates", "error of hidden pixels", "error of judging pixels", "in use", "seconds"],
+    measurements.flatMap(m => m.online.split.judgements.map(j => ({ warning: false, cells: [`${m.index}`, `${j.updates}`, small(j.hidden), small(j.judged), j.updates === m.online.split.kept ? "yes" : "", show(m.online.split.seconds, 1)] }))));
+}
 function run(r, images) {
   head(r);
   if (images.length) viewer(r, images);
@@ -310,6 +316,7 @@ function run(r, images) {
   table(section("Measurements"),
     ["measurement", "PSNR dB", "PSNR RGB dB", "SSIM", "SSIM (Gaussian)", "seconds", "iterations", "denoiser calls", "updates", "residual", "ended"],
     r.measurements.map(m => ({ warning: m.stop === "diverged", cells: [`${m.index}`, show(m.psnr_db, 2), show(m.psnr_rgb_db, 2), show(m.ssim, 4), show(m.ssim_gaussian, 4), show(m.seconds, 3), `${m.iterations}`, `${m.denoiser_calls}`, `${m.updates}`, small(m.relative_residual), words(m.stop)] })));
+  adaptation(r.measurements.filter(m => m.online?.split));
   const details = put(section(), "details");
   put(details, "summary", {}, "Resolved experiment");
   put(details, "pre", {}, JSON.stringify(r.config, null, 2));

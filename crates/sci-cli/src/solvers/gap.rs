@@ -29,6 +29,14 @@ impl Method for Projection {
         self.0.is_some()
     }
 
+    fn unrolled(&self) -> Option<bool> {
+        match self.0 {
+            None => Some(false),
+            Some(MomentumStart::Measurement) => Some(true),
+            Some(MomentumStart::Zero) => None,
+        }
+    }
+
     /// From where TV ends nothing is left to make up for.
     fn begin_with_tv(&mut self, json: &mut Value) -> bool {
         if let Some(momentum) = &mut self.0 {

@@ -102,6 +102,11 @@ pub trait Method: Debug + Send + Sync {
         false
     }
 
+    /// Whether it is accelerated, if it is one that networks can learn through.
+    fn unrolled(&self) -> Option<bool> {
+        None
+    }
+
     /// That of the reference code.
     fn default_demosaicer(&self) -> Demosaicer {
         Demosaicer::Menon

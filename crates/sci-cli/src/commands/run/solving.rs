@@ -9,7 +9,7 @@ use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
 
 use super::super::interrupted;
 use crate::config::Experiment;
-use crate::factory::{Factory, Solved};
+use crate::factory::{Factory, Follow, Solved};
 use crate::io::scene::Scene;
 use crate::pictures::Job;
 use crate::progress::Progress;
@@ -35,7 +35,8 @@ pub(super) fn solve_all(
         let truth = scene.truth_of(k);
         let mut watch = Watch::new(truth, Progress::new(k, planned));
         let start = previous.as_ref().map(|sensor| sensor.view());
-        let solved = factory.solve(scene, k, start, &mut watch).with_context(|| format!("measurement {k}"))?;
+        let solved =
+            factory.solve(scene, &chosen[i..], start, &mut watch).with_context(|| format!("measurement {k}"))?;
         let mut record = measurement_record(k, &solved, truth, watch.finish(), planned);
         let estimate = solved.outcome.estimate;
         record.psnr_rgb_db = estimate.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
@@ -141,7 +142,8 @@ fn line(m: &MeasurementRecord) -> String {
     let updates = m.online.as_ref().map_or(String::new(), |a| {
         let warm = if a.warm_start { ", from the result before" } else { "" };
         let cut = if a.cut { ", after a cut" } else { "" };
-        format!("   {} of {} updates kept{warm}{cut}", a.counts.kept, a.counts.fired + a.counts.skipped)
+        let took = a.split.as_ref().map_or(String::new(), |split| format!(" in {:.1} s", split.seconds));
+        format!("   {} of {} updates kept{took}{warm}{cut}", a.counts.kept, a.counts.fired + a.counts.skipped)
     });
     let backed_off = m
         .backed_off
@@ -198,6 +200,13 @@ impl Observer for Watch<'_> {
         }
         self.progress.step(it.iteration + 1, psnr_db);
         Ok(go_on())
+    }
+}
+
+impl Follow for Watch<'_> {
+    fn adaptation(&mut self, updates: usize) -> ControlFlow<()> {
+        self.progress.update(updates);
+        go_on()
     }
 }
 

@@ -1,0 +1,127 @@
+//! Measurement splitting with tiny networks.
+
+use candle_core::Tensor;
+use ndarray::{Array3, s};
+use nets::kernels::Precision;
+use nets::unrolled::Recipe;
+use nets::{Ffdnet, FfdnetSpec, Network, Parameters};
+use online::{Error, SplitConfig, SplitRecord, adapt_by_splitting};
+use sci_forward::testing::{moving_square, uniform};
+use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+use std::sync::Arc;
+
+const SHAPE: VideoShape = VideoShape { frames: 4, height: 40, width: 48 };
+const CONFIG: SplitConfig = SplitConfig {
+    updates: 12,
+    crops: 2,
+    side: 32,
+    hidden: 0.15,
+    calls: 2,
+    learning_rate: 1e-3,
+    average: 0.5,
+    judging: 0.1,
+    judged_crops: 4,
+    every: 4,
+    patience: 2,
+    parameters: Parameters::All,
+    precision: Precision::F32,
+    seed: 1,
+};
+
+fn net(channels: usize) -> Ffdnet {
+    Ffdnet::random(FfdnetSpec { channels, width: 8, depth: 3, ..FfdnetSpec::GRAY }, 1).unwrap()
+}
+
+fn recipe() -> Recipe {
+    Recipe { sigmas: vec![0.2, 0.1, 0.05], accelerate: true, start: Some((5, 0.1)), flips: true }
+}
+
+/// A moving square, of a color sensor if there is a pattern.
+fn measurement(cfa: Option<CfaPattern>) -> Measurement {
+    let h = MaskOperator::new(MaskStack::random(SHAPE, 0.5, 0).unwrap());
+    let y = h.forward(moving_square(SHAPE).view());
+    Measurement::new(Arc::new(h), y).unwrap().with_cfa(cfa)
+}
+
+fn bytes(net: &dyn Network) -> BTreeMap<String, Vec<u32>> {
+    let bits = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap().into_iter().map(f32::to_bits).collect();
+    net.state().into_iter().map(|(name, t)| (name, bits(t))).collect()
+}
+
+fn adapt(net: &mut Ffdnet, measurement: &Measurement, config: &SplitConfig) -> SplitRecord {
+    let all = std::slice::from_ref(measurement);
+    adapt_by_splitting(net, all, &recipe(), config, &mut |_| ControlFlow::Continue(())).unwrap()
+}
+
+/// A network that knows nothing becomes one that predicts pixels better which it never learned from, and solves the whole better.
+#[test]
+fn what_is_learned_predicts_pixels_that_were_not_learned_from() {
+    let square = measurement(None);
+    let mut learned = net(1);
+    let record = adapt(&mut learned, &square, &CONFIG);
+    let (first, last) = (record.judgements[0], *record.judgements.last().unwrap());
+    assert!(record.kept == 12 && last.updates == 12, "{record:?}");
+    assert!(last.judged < 0.9 * first.judged, "{record:?}");
+    let error = |net: &mut Ffdnet| {
+        let found = recipe().solve(&square, net).unwrap();
+        (found.index_axis_move(ndarray::Axis(1), 0) - moving_square(SHAPE)).mapv(|e| e * e).mean().unwrap()
+    };
+    assert!(error(&mut learned) < error(&mut net(1)));
+}
+
+#[test]
+fn in_color_it_learns_too() {
+    let mosaic = measurement(Some(CfaPattern::Gbrg));
+    // Through a demosaicer a network that knows nothing takes longer to be of use.
+    let record = adapt(&mut net(3), &mosaic, &SplitConfig { updates: 24, patience: 6, ..CONFIG });
+    assert!(record.kept > 8, "{record:?}");
+}
+
+#[test]
+fn weights_that_predict_worse_are_not_kept() {
+    // Steps this long overshoot.
+    let config = SplitConfig { learning_rate: 1.0, ..CONFIG };
+    let mut net = net(1);
+    let before = bytes(&net);
+    let record = adapt(&mut net, &measurement(None), &config);
+    assert_eq!((record.kept, bytes(&net)), (0, before));
+    assert!(record.updates() <= 8, "two judgements in vain end it: {record:?}");
+}
+
+#[test]
+fn several_measurements_are_learned_from_and_a_stop_is_heeded() {
+    let (mut learned, mut told) = (net(1), Vec::new());
+    let all = [measurement(None), measurement(None)];
+    let mut watch = |updates| {
+        told.push(updates);
+        if updates == 3 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    };
+    let record = adapt_by_splitting(&mut learned, &all, &recipe(), &CONFIG, &mut watch).unwrap();
+    assert_eq!((told, record.updates()), (vec![1, 2, 3], 3));
+}
+
+#[test]
+fn the_number_of_threads_changes_nothing() {
+    let square = measurement(None);
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut net = net(1);
+            let record = adapt(&mut net, &square, &SplitConfig { updates: 4, ..CONFIG });
+            (record.judgements, bytes(&net))
+        })
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn where_nothing_can_judge_it_says_so() {
+    let masks = Array3::from_shape_fn((2, 20, 20), |(_, y, x)| f32::from(u8::from((y, x) == (3, 3))));
+    let h = MaskOperator::new(MaskStack::new(masks).unwrap());
+    let y = uniform((1, 20, 20), 1).slice(s![0, .., ..]).to_owned();
+    let one = Measurement::new(Arc::new(h), y).unwrap();
+    let result = adapt_by_splitting(&mut net(1), &[one], &recipe(), &CONFIG, &mut |_| ControlFlow::Continue(()));
+    assert!(matches!(result, Err(Error::NothingToJudge)), "{result:?}");
+}
