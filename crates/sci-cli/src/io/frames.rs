@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::{CompressionType, FilterType, PngDecoder, PngEncoder};
 use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageResult, Limits};
-use ndarray::{Array4, ArrayView3, ArrayView4, Axis, Zip, s};
+use ndarray::{Array4, ArrayView1, ArrayView3, ArrayView4, ArrayViewMut1, Axis};
 use rayon::prelude::*;
 
 use super::samples::{Array, Budget, SampleType, Samples};
@@ -234,18 +234,23 @@ pub fn pngs(video: ArrayView4<'_, f32>) -> ImageResult<Vec<Vec<u8>>> {
 /// Half the height and width of a video `[T, C, H, W]`, each pixel the mean of four; an odd last row or column is left out.
 pub fn halved(video: ArrayView4<'_, f32>) -> Array4<f32> {
     let (frames, channels, height, width) = video.dim();
-    let (h, w) = ((height / 2).max(1), (width / 2).max(1));
-    let mut half = Array4::zeros((frames, channels, h, w));
+    let mut half = Array4::zeros((frames, channels, (height / 2).max(1), (width / 2).max(1)));
     half.axis_iter_mut(Axis(0)).into_par_iter().zip(video.axis_iter(Axis(0))).for_each(|(mut half, frame)| {
-        // Every other pixel from the first or the second on; of a single row or column it is the same.
-        let from = |y: usize, x: usize| {
-            let (y, x) = (y.min(height - 1), x.min(width - 1));
-            frame.slice(s![.., y..(2 * h).min(height);2, x..(2 * w).min(width);2])
-        };
-        let (a, b, c, d) = (from(0, 0), from(0, 1), from(1, 0), from(1, 1));
-        Zip::from(&mut half).and(a).and(b).and(c).and(d).for_each(|half, a, b, c, d| *half = 0.25 * (a + b + c + d));
+        for (mut half, plane) in half.outer_iter_mut().zip(frame.outer_iter()) {
+            for (y, half) in half.outer_iter_mut().enumerate() {
+                halve(half, plane.row(2 * y), plane.row((2 * y + 1).min(height - 1)));
+            }
+        }
     });
     half
+}
+
+fn halve(half: ArrayViewMut1<'_, f32>, top: ArrayView1<'_, f32>, bottom: ArrayView1<'_, f32>) {
+    // A single column stands beside itself.
+    let pairs = |row: ArrayView1<'_, f32>| if row.len() == 1 { vec![row[0]; 2] } else { row.to_vec() };
+    let (top, bottom) = (pairs(top), pairs(bottom));
+    let fours = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+    half.into_iter().zip(fours).for_each(|(half, ([a, b], [c, d]))| *half = 0.25 * (a + b + c + d));
 }
 
 /// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
