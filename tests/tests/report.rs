@@ -1,4 +1,4 @@
-//! `report.html` in a real browser: it loads without an error and the slider changes the frame.
+//! `report.html` in a real browser: it loads without an error, and slider and keys change the frame.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -40,6 +40,12 @@ addEventListener("load", () => {
   choice.value = 1;
   choice.dispatchEvent(new Event("change"));
   seen.push("measurement " + look());
+  // False where the page takes the key.
+  const key = (target, init) => target.dispatchEvent(new KeyboardEvent("keydown", { bubbles: true, cancelable: true, ...init }));
+  const summary = document.querySelector("summary");
+  seen.push("theirs " + [key(document, { key: "ArrowLeft", altKey: true }), key(summary, { key: " " }), key(choice, { key: "ArrowRight" })]);
+  const play = [...document.querySelectorAll("button")].find(b => b.textContent === "play");
+  seen.push("space " + [key(document.body, { key: " " }), play.textContent, key(document.body, { key: " " }), play.textContent, slider.value]);
   const pre = document.createElement("pre");
   pre.id = "seen";
   pre.textContent = seen.join("\n");
@@ -72,7 +78,9 @@ fn the_slider_changes_the_frame() {
     let seen =
         dom.split_once("<pre id=\"seen\">").and_then(|(_, rest)| rest.split_once("</pre>")).map(|(seen, _)| seen);
     let seen: Vec<&str> = seen.expect("the page ran to its end").lines().collect();
-    assert_eq!(seen.len(), 4, "{seen:#?}");
+    assert_eq!(seen.len(), 6, "{seen:#?}");
+    assert_eq!(seen[4..], ["theirs true,true,true", "space false,pause,false,play,1"]);
+    let seen = &seen[..4];
     let fields: Vec<Vec<&str>> = seen.iter().map(|line| line.split(" | ").collect()).collect();
     for (line, (doing, frame)) in fields.iter().zip([("start", 0), ("slider", 2), ("key", 1), ("measurement", 1)]) {
         assert_eq!(line[0], format!("{doing} {frame}"));

@@ -296,6 +296,19 @@ fn what_is_not_the_runs_is_neither_removed_nor_overwritten() {
 }
 
 #[test]
+fn a_run_of_an_earlier_version_is_not_replaced_unasked() {
+    let bench = bench(1);
+    ok(&bench, &["--out", "out"]);
+    let mut record = bench.record("out");
+    record.as_object_mut().unwrap().remove("files");
+    bench.write("out/record.json", record.to_string());
+    refused(&bench, &["--out", "out"], &["out", "`frames`", "earlier version", "remove the folder"]);
+    let before = contents(&bench.path("out"));
+    refused(&bench, &["--out", "out", "--restart"], &["earlier version"]);
+    assert!(contents(&bench.path("out")) == before, "a refused run changes nothing");
+}
+
+#[test]
 fn a_folder_never_holds_parts_of_two_runs() {
     let bench = bench(3);
     ok(&bench, &["--out", "out"]);
@@ -391,6 +404,80 @@ fn a_full_disk_costs_at_most_the_measurement_in_work() {
     let nothing = limited(32, "--restart");
     assert_eq!(nothing.code, 1, "{}", nothing.stderr);
     assert!(!bench.path("out/.sci-run").exists() && bench.path("out/record.json").is_file());
+}
+
+/// A file system of its own, of `size`, gone with the test.
+struct Disk(PathBuf);
+
+impl Disk {
+    /// Nothing, and a word, where none may be mounted.
+    fn mount(at: PathBuf, size: &str) -> Option<Self> {
+        fs::create_dir(&at).unwrap();
+        if mount(&at, &format!("size={size}")) {
+            return Some(Self(at));
+        }
+        test_data::skip("no file system can be mounted (that takes root, and a system that lets it)");
+        None
+    }
+
+    fn grow(&self, size: &str) {
+        assert!(mount(&self.0, &format!("remount,size={size}")));
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(&self.0).status();
+    }
+}
+
+fn mount(at: &Path, options: &str) -> bool {
+    let mount = Command::new("mount").args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(at).output();
+    mount.is_ok_and(|output| output.status.success())
+}
+
+#[test]
+fn a_full_file_system_loses_nothing_that_is_solved() {
+    let bench = bench(6);
+    ok(&bench, &["--out", "whole"]);
+    // A measurement takes 64 KiB and its pictures as much again.
+    let Some(disk) = Disk::mount(bench.path("disk"), "384k") else { return };
+    let failed = run(&bench, &["--out", "disk/out"]);
+    assert_eq!(failed.code, 1, "{}", failed.stderr);
+    assert!(failed.stderr.contains("No space left") && failed.stderr.contains("--resume"), "{}", failed.stderr);
+    assert!(!bench.path("disk/out/record.json").exists());
+    disk.grow("16m");
+    let resumed = ok(&bench, &["--out", "disk/out", "--resume"]);
+    assert!(resumed.stdout.contains("going on: "), "{}", resumed.stdout);
+    assert_same(&bench.path("disk/out"), &bench.path("whole"));
+}
+
+#[test]
+fn memory_does_not_grow_with_the_number_of_measurements() {
+    const RESULT: u64 = 16 * 128 * 128 * 4;
+    let peak = |measurements: usize| {
+        let bench = Bench::new();
+        fs::create_dir(bench.path("scene")).unwrap();
+        let mask = Array3::from_shape_fn((16, 128, 128), |(t, y, x)| ((t * 7 + y * 5 + x * 3) % 4 < 2) as u8 as f32);
+        let meas = Array3::from_shape_fn((measurements, 128, 128), |(k, y, x)| 4.0 + ((k + y + x) % 7) as f32 * 0.1);
+        bench.write("scene/mask.npy", npy(&mask));
+        bench.write("scene/meas.npy", npy(&meas));
+        fs::create_dir(bench.path("here")).unwrap();
+        bench.write("here/a.toml", CONFIG.replace("iterations = 20", "iterations = 2"));
+        // One thread has one heap.
+        ok(&bench, &["--out", "out", "--threads", "1"]);
+        bench.record("out")["peak_rss_bytes"].as_u64().unwrap()
+    };
+    let (few, many) = (peak(2), peak(42));
+    if few == 0 {
+        test_data::skip("the system does not tell how much memory a process had");
+        return;
+    }
+    assert!(
+        many < few + 10 * RESULT,
+        "{few} bytes for 2 measurements, {many} for 42, whose results take {}",
+        42 * RESULT
+    );
 }
 
 #[test]

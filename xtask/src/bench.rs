@@ -7,9 +7,7 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 
-use crate::workspace::{
-    built_sci, cargo, cpu, json_lines, median, output, range, results_dir, revision, root, sci_run, shared,
-};
+use crate::workspace::{Sci, cargo, cpu, json_lines, median, output, range, results_dir, revision, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -82,14 +80,13 @@ pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
     ensure!(scene.is_file(), "{} is missing", scene.display());
     let weights = (name == "gap-ffdnet").then(|| shared.join("weights/ffdnet_gray_ipol.pth"));
     let peer = options.peer_script()?;
-    let sci = built_sci()?;
+    let sci = Sci::build(Some(&shared))?;
     let (mut ours, mut theirs) = (Side::default(), Side::default());
     let config = root().join(format!("configs/gray/{name}.toml"));
     let mut sets = vec![format!("data.path={}", scene.display()), "data.measurements=[0]".into()];
     sets.extend(weights.as_ref().map(|w| format!("denoiser.weights={}", w.display())));
-    let out = std::env::temp_dir().join(format!("sci-bench-{}", std::process::id()));
     for _ in 0..options.runs {
-        let record = sci_run(&sci, &config, &sets, &out)?.success()?;
+        let record = sci.run(&config, &sets)?.success()?;
         let m = &record["measurements"][0];
         ours.push(&m["seconds"], &m["psnr_db"], &m["ssim"])?;
         if let Some((python, script)) = &peer {
@@ -98,7 +95,6 @@ pub(crate) fn solver(name: &str, options: &Options) -> anyhow::Result<()> {
             theirs.push(&r["seconds"], &r["psnr"], &r["ssim"])?;
         }
     }
-    let _ = fs::remove_dir_all(&out);
     println!("{name} on {}, measurement 0", options.scene);
     println!("{}", ours.line("sci"));
     let mut result = json!({ "benchmark": name, "scene": options.scene, "sci": ours.json() });

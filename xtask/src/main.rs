@@ -3,6 +3,7 @@
 //! They drive the built `sci` and read its run records; nothing here links the solvers.
 
 mod bench;
+mod circles;
 mod pareto;
 mod plot;
 mod repro;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Deserialize;
 
-use crate::workspace::{built_sci, results_dir, root, sci_run, shared};
+use crate::workspace::{Sci, results_dir, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -92,7 +92,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let expected: Expected = toml::from_str(&text).with_context(|| path.display().to_string())?;
     let table = if options.table == Which::TableGray { &expected.gray } else { &expected.color };
     let shared = shared(options.shared.as_deref())?;
-    let sci = built_sci()?;
+    let sci = Sci::build(Some(&shared))?;
     let mut off = Vec::new();
     let mut kept = String::new();
     // Rows take minutes: each is printed when it is there.
@@ -135,7 +135,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
 }
 
 /// One cell, or what it lacks.
-fn cell(sci: &Path, shared: &Path, row: &Row, scene: &Scene) -> anyhow::Result<Result<Ours, String>> {
+fn cell(sci: &Sci, shared: &Path, row: &Row, scene: &Scene) -> anyhow::Result<Result<Ours, String>> {
     let needed =
         [format!("data/{}", scene.file)].into_iter().chain(row.weights.values().map(|w| format!("weights/{w}")));
     let missing: Vec<String> = needed.filter(|file| !shared.join(file).is_file()).collect();
@@ -149,11 +149,7 @@ fn cell(sci: &Path, shared: &Path, row: &Row, scene: &Scene) -> anyhow::Result<R
     let mut sets = vec![format!("data.path={}", shared.join("data").join(&scene.file).display())];
     sets.extend(scene.measurements.iter().map(|m| format!("data.measurements={m:?}")));
     sets.extend(row.weights.iter().map(|(key, file)| format!("{key}={}", shared.join("weights").join(file).display())));
-    sets.extend(["output.frames=false", "output.preview=false"].map(String::from));
-    let out = std::env::temp_dir().join(format!("sci-repro-{}", std::process::id()));
-    let finished = sci_run(sci, &config, &sets, &out)?;
-    let _ = fs::remove_dir_all(&out);
-    let record = match finished.success() {
+    let record = match sci.run(&config, &sets)?.success() {
         Ok(record) => record,
         Err(e) => return Ok(Err(e.to_string().lines().last().unwrap_or("failed").to_owned())),
     };

@@ -8,7 +8,7 @@ use anyhow::Context;
 use serde_json::Value;
 
 use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
-use crate::workspace::{built_sci, results_dir, root, sci_run};
+use crate::workspace::{Sci, results_dir, root};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -56,13 +56,11 @@ impl Run {
 
 /// Runs every schedule with every number of updates, and prints the table.
 pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
-    let sci = built_sci()?;
-    let dir = std::env::temp_dir().join(format!("sci-sensitivity-{}", std::process::id()));
-    fs::create_dir_all(&dir)?;
+    let sci = Sci::build(None)?;
     let mut runs = Vec::new();
     for (schedule, iterations) in SCHEDULES {
         for updates in UPDATES {
-            let mut sets = vec![format!("schedule={schedule}"), "output.frames=false".into()];
+            let mut sets = vec![format!("schedule={schedule}")];
             if updates > 0 {
                 let interval = iterations / (updates + 1);
                 sets.push("online.enabled=true".into());
@@ -71,12 +69,10 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
             }
             sets.extend(options.scene.iter().map(|scene| format!("data.path={}", scene.display())));
             let name = format!("{}, {updates} updates", schedule.to_uppercase());
-            let finished = sci_run(&sci, &root().join(CONFIG), &sets, &dir.join("out"))?;
-            let record = finished.success().with_context(|| name.clone())?;
+            let record = sci.run(&root().join(CONFIG), &sets)?.success().with_context(|| name.clone())?;
             runs.push(Run::read(name, &record)?);
         }
     }
-    fs::remove_dir_all(&dir)?;
     let table = table(&runs);
     print!("{table}");
     if options.save {

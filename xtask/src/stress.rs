@@ -8,7 +8,7 @@ use anyhow::ensure;
 use serde_json::Value;
 
 use crate::plot::{Axis, Look, Plot, Series, SeriesLabelPosition};
-use crate::workspace::{Finished, built_sci, cargo, json_lines, output, results_dir, sci_run, shared};
+use crate::workspace::{Finished, Sci, cargo, json_lines, output, results_dir, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -299,28 +299,23 @@ fn cases() -> Vec<Case> {
 
 /// The table of the cases through the program, and its faults.
 fn through_sci(options: &Options) -> anyhow::Result<(String, Vec<String>)> {
-    let sci = built_sci()?;
-    let weights =
-        shared(options.shared.as_deref()).ok().map(|s| s.join("weights/ffdnet_gray.pth")).filter(|w| w.is_file());
-    let dir = std::env::temp_dir().join(format!("sci-stress-{}", std::process::id()));
+    let sci = Sci::build(options.shared.as_deref())?;
+    let has_weights = shared(options.shared.as_deref()).is_ok_and(|s| s.join("weights/ffdnet_gray.pth").is_file());
+    let dir = tempfile::tempdir()?;
+    let dir = dir.path();
     let mut text = String::from("\n| through `sci run` | exit code | outcome |\n|---|---|---|\n");
     let mut faults = Vec::new();
     for (name, scene, experiment, sets, ends) in cases() {
-        let mut sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
-        if experiment == FFDNET {
-            let Some(weights) = &weights else {
-                text += &format!("| {name} | – | no data: weights/ffdnet_gray.pth |\n");
-                continue;
-            };
-            sets.push(format!("denoiser.weights={}", weights.display()));
+        if experiment == FFDNET && !has_weights {
+            text += &format!("| {name} | – | no data: weights/ffdnet_gray.pth |\n");
+            continue;
         }
+        let sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
         scene.write(&dir.join("scene"))?;
         let config = dir.join("stress.toml");
-        fs::write(&config, format!("[data]\npath = 'scene'\n{experiment}[output]\nframes = false\npreview = false\n"))?;
-        let out = dir.join("out");
-        let _ = fs::remove_dir_all(&out);
-        let finished = sci_run(&sci, &config, &sets, &out)?;
-        let recon = fs::read(out.join("recon.npy")).unwrap_or_default();
+        fs::write(&config, format!("[data]\npath = 'scene'\n{experiment}"))?;
+        let finished = sci.run(&config, &sets)?;
+        let recon = fs::read(finished.folder.join("recon.npy")).unwrap_or_default();
         match outcome(&finished, &recon, ends) {
             Ok(outcome) => text += &format!("| {name} | {} | {outcome} |\n", finished.code.unwrap_or(-1)),
             Err(fault) => {
@@ -329,7 +324,6 @@ fn through_sci(options: &Options) -> anyhow::Result<(String, Vec<String>)> {
             }
         }
     }
-    fs::remove_dir_all(&dir)?;
     Ok((text, faults))
 }
 

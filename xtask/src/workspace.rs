@@ -5,6 +5,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
 use serde_json::Value;
+use tempfile::TempDir;
 
 /// The root of the repository.
 pub(crate) fn root() -> &'static Path {
@@ -24,15 +25,6 @@ pub(crate) fn output(command: &mut Command) -> anyhow::Result<String> {
     let output = command.stderr(Stdio::inherit()).output().with_context(|| named.clone())?;
     ensure!(output.status.success(), "{named}: {}", output.status);
     String::from_utf8(output.stdout).with_context(|| named)
-}
-
-/// Builds `sci` in release mode and says where it is.
-pub(crate) fn built_sci() -> anyhow::Result<PathBuf> {
-    let messages =
-        output(cargo().args(["build", "--release", "-p", "sci-cli", "--bin", "sci", "--message-format=json"]))?;
-    json_lines(&messages)
-        .find_map(|message| message["executable"].as_str().map(PathBuf::from))
-        .context("cargo did not name the binary it built")
 }
 
 /// The JSON objects that lines end with; before one the test harness may have put a dot for a test that passed.
@@ -68,27 +60,53 @@ pub(crate) fn cpu() -> String {
     name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
 }
 
-/// How a run of `sci` ended: exit code, what it said on standard error, and its record if it left one.
+/// The built `sci`, and a folder for its runs, which goes with it.
+pub(crate) struct Sci {
+    program: PathBuf,
+    /// Where scenes and weights are that an experiment names.
+    data: PathBuf,
+    runs: TempDir,
+}
+
+impl Sci {
+    /// Builds it in release mode. `data` as for [`shared`], but it need not be there.
+    pub(crate) fn build(data: Option<&Path>) -> anyhow::Result<Self> {
+        let messages =
+            output(cargo().args(["build", "--release", "-p", "sci-cli", "--bin", "sci", "--message-format=json"]))?;
+        let program = json_lines(&messages)
+            .find_map(|message| message["executable"].as_str().map(PathBuf::from))
+            .context("cargo did not name the binary it built")?;
+        let data = std::path::absolute(data.map_or_else(test_data::folder, PathBuf::from))?;
+        Ok(Self { program, data, runs: tempfile::tempdir().context("no temporary folder")? })
+    }
+
+    /// `sci run CONFIG --set ...`, without pictures. What it left is there until the next run.
+    pub(crate) fn run(&self, config: &Path, sets: &[String]) -> anyhow::Result<Finished> {
+        let folder = self.runs.path().join("run");
+        let _ = std::fs::remove_dir_all(&folder);
+        let mut command = Command::new(&self.program);
+        command.arg("run").arg(config).arg("--out").arg(&folder).env("SCI_DATA", &self.data);
+        command.args(["--set", "output=minimal"]);
+        sets.iter().for_each(|set| {
+            command.arg("--set").arg(set);
+        });
+        let output = command.output().with_context(|| format!("{command:?}"))?;
+        let record = std::fs::read_to_string(folder.join("record.json")).ok();
+        Ok(Finished {
+            code: output.status.code(),
+            stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+            record: record.map(|r| serde_json::from_str(&r)).transpose()?,
+            folder,
+        })
+    }
+}
+
+/// How a run of `sci` ended: exit code, what it said on standard error, its record if it left one, and where the rest is.
 pub(crate) struct Finished {
     pub(crate) code: Option<i32>,
     pub(crate) stderr: String,
     pub(crate) record: Option<Value>,
-}
-
-/// `sci run CONFIG --set ...` into `out`.
-pub(crate) fn sci_run(sci: &Path, config: &Path, sets: &[String], out: &Path) -> anyhow::Result<Finished> {
-    let mut command = Command::new(sci);
-    command.arg("run").arg(config).arg("--out").arg(out);
-    sets.iter().for_each(|set| {
-        command.arg("--set").arg(set);
-    });
-    let output = command.output().with_context(|| format!("{command:?}"))?;
-    let record = std::fs::read_to_string(out.join("record.json")).ok();
-    Ok(Finished {
-        code: output.status.code(),
-        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
-        record: record.map(|r| serde_json::from_str(&r)).transpose()?,
-    })
+    pub(crate) folder: PathBuf,
 }
 
 impl Finished {

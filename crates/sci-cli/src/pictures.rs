@@ -6,9 +6,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 
 use admm::Estimate;
 use anyhow::Context;
-use image::ImageError;
-use ndarray::{Array4, ArrayView3, ArrayView4, Axis, stack};
-use rayon::prelude::*;
+use ndarray::{ArrayView4, Axis};
 
 use crate::config::Output;
 use crate::io::output::{WriteError, write_atomically};
@@ -115,7 +113,7 @@ impl Studio<'_> {
 
     /// Each frame as a PNG, which the report may use too.
     fn frames(&self, dir: &Path, index: usize, result: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, WriteError> {
-        let pngs = pngs(result).map_err(|e| WriteError::new(dir, e))?;
+        let pngs = frames::pngs(result).map_err(|e| WriteError::new(dir, e))?;
         for (t, png) in pngs.iter().enumerate() {
             let path = dir.join(frame_name(index, t));
             fs::write(&path, png).map_err(|e| WriteError::new(&path, e))?;
@@ -124,8 +122,7 @@ impl Studio<'_> {
     }
 
     fn preview(&self, path: &Path, result: ArrayView4<'_, f32>) -> Result<(), WriteError> {
-        let (_, _, height, width) = result.dim();
-        let small = (height.max(width) > PREVIEW_SIDE).then(|| halved_to(result, PREVIEW_SIDE));
+        let small = (frames::longer_side(result) > PREVIEW_SIDE).then(|| frames::halved_to(result, PREVIEW_SIDE));
         let shown = small.as_ref().map_or(result, |small| small.view());
         write_atomically(path, |w| video::write_gif(w, shown, self.output.fps))
     }
@@ -151,26 +148,4 @@ impl Studio<'_> {
         let json = serde_json::to_vec(&pictures).map_err(|e| WriteError::new(path, e))?;
         fs::write(path, json).map_err(|e| WriteError::new(path, e))
     }
-}
-
-/// Each frame of `[T, C, H, W]` as a PNG.
-///
-/// # Errors
-/// The encoder's.
-pub fn pngs(video: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, ImageError> {
-    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
-    frames.par_iter().map(|frame| frames::png(*frame)).collect()
-}
-
-/// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
-///
-/// # Panics
-/// Never: the frames that are joined again are of one size.
-pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
-    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
-    let halved: Vec<_> = frames.par_iter().map(|frame| frames::halved(*frame)).collect();
-    let views: Vec<_> = halved.iter().map(|frame| frame.view()).collect();
-    let small = stack(Axis(0), &views).expect("frames of a video are of one size");
-    let (_, _, height, width) = small.dim();
-    if height.max(width) > side { halved_to(small.view(), side) } else { small }
 }

@@ -5,7 +5,7 @@
 
 use multiversion::multiversion;
 use ndarray::parallel::prelude::*;
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Zip};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Zip, s};
 
 /// Peak signal-to-noise ratio `10 log10(1 / MSE)` in dB of an image `[H, W]` with data range 1; infinite for equal images.
 ///
@@ -138,12 +138,20 @@ fn ssim_with(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>, taps: &
 
 /// The separable filter `taps ⊗ taps` where it lies inside the image.
 fn filter_valid(image: &Array2<f64>, taps: &[f64]) -> Array2<f64> {
-    let (height, width) = image.dim();
-    let n = taps.len();
-    let rows = Array2::from_shape_fn((height, width + 1 - n), |(i, j)| {
-        (0..n).map(|k| taps[k] * image[[i, j + k]]).sum::<f64>()
-    });
-    Array2::from_shape_fn((height + 1 - n, width + 1 - n), |(i, j)| (0..n).map(|k| taps[k] * rows[[i + k, j]]).sum())
+    let (height, width) = (image.nrows() + 1 - taps.len(), image.ncols() + 1 - taps.len());
+    let mut rows = Array2::zeros((image.nrows(), width));
+    for (image, mut row) in image.outer_iter().zip(rows.outer_iter_mut()) {
+        for (k, &tap) in taps.iter().enumerate() {
+            row.scaled_add(tap, &image.slice(s![k..k + width]));
+        }
+    }
+    let mut filtered = Array2::zeros((height, width));
+    for (i, mut row) in filtered.outer_iter_mut().enumerate() {
+        for (k, &tap) in taps.iter().enumerate() {
+            row.scaled_add(tap, &rows.row(i + k));
+        }
+    }
+    filtered
 }
 
 #[cfg(test)]

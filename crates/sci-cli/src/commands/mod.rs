@@ -11,6 +11,8 @@ macro_rules! outln {
 }
 
 mod calibrate;
+mod completions;
+mod man;
 mod mask;
 mod metrics;
 mod report;
@@ -43,6 +45,9 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Run an experiment file
+    ///
+    /// A measurement is on disk as soon as it is solved. A run that was stopped, by whatever, goes on with --resume, which repeats
+    /// at most the measurement in work. Without --resume a folder with a stopped run is refused, so that nothing solved is lost.
     Run(run::Args),
     /// Find how the masks really sit, from measurements alone
     Calibrate(calibrate::Args),
@@ -59,6 +64,14 @@ enum Command {
     Weights(weights::Command),
     /// Compare finished runs
     Report(report::Args),
+    /// Print what makes a shell complete the commands
+    ///
+    /// For bash, for example: sci completions bash > ~/.local/share/bash-completion/completions/sci
+    Completions(completions::Args),
+    /// Write the manual pages
+    ///
+    /// For example: sci man --out ~/.local/share/man/man1, then man sci-run
+    Man(man::Args),
 }
 
 /// How a command ended well.
@@ -112,6 +125,8 @@ impl Command {
             Command::Train(args) => args.run(),
             Command::Weights(command) => command.run(),
             Command::Report(args) => args.run(),
+            Command::Completions(args) => args.run(),
+            Command::Man(args) => args.run(),
         }
     }
 }

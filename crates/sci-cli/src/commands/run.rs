@@ -22,9 +22,6 @@ use crate::run_folder::{Finished, RunFolder, RunPlan, Wish, refuse_inputs};
 use crate::simulate::{SeededNoise, simulate};
 
 /// Arguments of `sci run`.
-///
-/// A measurement is on disk as soon as it is solved. A run that was stopped, by whatever, goes on with --resume, which repeats at
-/// most the measurement in work. Without --resume a folder with a stopped run is refused, so that nothing solved is lost.
 #[derive(Debug, clap::Args)]
 pub(super) struct Args {
     /// The experiment file, TOML

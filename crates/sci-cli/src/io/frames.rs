@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::{CompressionType, FilterType, PngDecoder, PngEncoder};
 use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageResult, Limits};
-use ndarray::{Array3, ArrayView3};
+use ndarray::{Array4, ArrayView1, ArrayView3, ArrayView4, ArrayViewMut1, Axis};
+use rayon::prelude::*;
 
 use super::samples::{Array, Budget, SampleType, Samples};
 use super::{FileError, Format, ReadError, read_file, tiff};
@@ -188,7 +189,20 @@ pub(super) fn push_planes<T: Copy>(out: &mut Vec<T>, interleaved: &[T], stride: 
 
 /// A sample of `[0, 1]` as a byte, rounded, clipped; NaN becomes 0.
 pub fn to_byte(x: f32) -> u8 {
-    (x.clamp(0.0, 1.0) * 255.0).round() as u8
+    // Not `round`, which is a call into the mathematical library for each sample.
+    (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+}
+
+/// The bytes of a frame `[C, H, W]`, pixel by pixel.
+pub fn to_pixels(frame: ArrayView3<'_, f32>) -> Vec<u8> {
+    let (channels, height, width) = frame.dim();
+    let mut pixels = vec![0; channels * height * width];
+    for (c, plane) in frame.outer_iter().enumerate() {
+        for (row, out) in plane.outer_iter().zip(pixels.chunks_exact_mut(channels * width)) {
+            row.iter().zip(out[c..].iter_mut().step_by(channels)).for_each(|(&v, byte)| *byte = to_byte(v));
+        }
+    }
+    pixels
 }
 
 /// One frame `[C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as the bytes of an 8-bit PNG, compressed fast rather than well.
@@ -197,11 +211,10 @@ pub fn to_byte(x: f32) -> u8 {
 /// The encoder's, for a frame without pixels.
 pub fn png(frame: ArrayView3<'_, f32>) -> ImageResult<Vec<u8>> {
     let (channels, height, width) = frame.dim();
-    let pixels: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&v| to_byte(v)).collect();
     let color = if channels == 1 { ExtendedColorType::L8 } else { ExtendedColorType::Rgb8 };
     let mut bytes = Vec::new();
     PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive).write_image(
-        &pixels,
+        &to_pixels(frame),
         width as u32,
         height as u32,
         color,
@@ -209,19 +222,56 @@ pub fn png(frame: ArrayView3<'_, f32>) -> ImageResult<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Half the height and width of a frame `[C, H, W]`, each pixel the mean of four; an odd last row or column is left out.
-pub fn halved(frame: ArrayView3<'_, f32>) -> Array3<f32> {
-    let (channels, height, width) = frame.dim();
-    Array3::from_shape_fn((channels, (height / 2).max(1), (width / 2).max(1)), |(c, y, x)| {
-        let at = |dy: usize, dx: usize| frame[[c, (2 * y + dy).min(height - 1), (2 * x + dx).min(width - 1)]];
-        0.25 * (at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1))
-    })
+/// Each frame of `[T, C, H, W]` as a PNG.
+///
+/// # Errors
+/// The encoder's.
+pub fn pngs(video: ArrayView4<'_, f32>) -> ImageResult<Vec<Vec<u8>>> {
+    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
+    frames.par_iter().map(|frame| png(*frame)).collect()
+}
+
+/// Half the height and width of a video `[T, C, H, W]`, each pixel the mean of four; an odd last row or column is left out.
+pub fn halved(video: ArrayView4<'_, f32>) -> Array4<f32> {
+    let (frames, channels, height, width) = video.dim();
+    let mut half = Array4::zeros((frames, channels, (height / 2).max(1), (width / 2).max(1)));
+    half.axis_iter_mut(Axis(0)).into_par_iter().zip(video.axis_iter(Axis(0))).for_each(|(mut half, frame)| {
+        for (mut half, plane) in half.outer_iter_mut().zip(frame.outer_iter()) {
+            for (y, half) in half.outer_iter_mut().enumerate() {
+                halve(half, plane.row(2 * y), plane.row((2 * y + 1).min(height - 1)));
+            }
+        }
+    });
+    half
+}
+
+fn halve(half: ArrayViewMut1<'_, f32>, top: ArrayView1<'_, f32>, bottom: ArrayView1<'_, f32>) {
+    // A single column stands beside itself.
+    let pairs = |row: ArrayView1<'_, f32>| if row.len() == 1 { vec![row[0]; 2] } else { row.to_vec() };
+    let (top, bottom) = (pairs(top), pairs(bottom));
+    let fours = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+    half.into_iter().zip(fours).for_each(|(half, ([a, b], [c, d]))| *half = 0.25 * (a + b + c + d));
+}
+
+/// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
+pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
+    let mut small = halved(video);
+    while longer_side(small.view()) > side {
+        small = halved(small.view());
+    }
+    small
+}
+
+/// The larger of height and width.
+pub fn longer_side(video: ArrayView4<'_, f32>) -> usize {
+    video.len_of(Axis(2)).max(video.len_of(Axis(3)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use image::{ImageBuffer, Luma};
+    use ndarray::{Array2, Array3, arr2};
 
     fn write_png(path: &Path, frame: ArrayView3<'_, f32>) -> ImageResult<()> {
         Ok(fs::write(path, png(frame)?)?)
@@ -229,9 +279,22 @@ mod tests {
 
     #[test]
     fn half_a_frame_is_the_mean_of_four_pixels() {
-        let frame = Array3::from_shape_fn((1, 3, 4), |(_, y, x)| (4 * y + x) as f32);
-        assert_eq!(halved(frame.view()), ndarray::arr3(&[[[2.5, 4.5]]]));
-        assert_eq!(halved(ndarray::arr3(&[[[3.0]]]).view()), ndarray::arr3(&[[[3.0]]]));
+        let half = |frame: Array2<f32>| halved(frame.view().insert_axis(Axis(0)).insert_axis(Axis(0)));
+        let plane = |half: Array4<f32>| half.index_axis_move(Axis(0), 0).index_axis_move(Axis(0), 0);
+        let frame = Array2::from_shape_fn((3, 5), |(y, x)| (4 * y + x) as f32);
+        assert_eq!(plane(half(frame)), arr2(&[[2.5, 4.5]]));
+        assert_eq!(plane(half(arr2(&[[3.0]]))), arr2(&[[3.0]]));
+        assert_eq!(plane(half(arr2(&[[3.0, 5.0]]))), arr2(&[[4.0]]));
+    }
+
+    #[test]
+    fn bytes_are_rounded_and_clipped_and_stand_pixel_by_pixel() {
+        assert_eq!(
+            [-1.0, 0.0, 0.499 / 255.0, 0.501 / 255.0, 1.0, 9.0, f32::NAN].map(to_byte),
+            [0, 0, 0, 1, 255, 255, 0]
+        );
+        let frame = Array3::from_shape_fn((3, 1, 2), |(c, _, x)| (10 * c + x) as f32 / 255.0);
+        assert_eq!(to_pixels(frame.view()), [0, 10, 20, 1, 11, 21]);
     }
 
     #[test]

@@ -185,9 +185,7 @@ pub fn read_npz(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError>
         let limit = budget.left();
         let mut raw = Vec::new();
         member.take(limit as u64 + 1).read_to_end(&mut raw).map_err(|e| broken(&format!("`{name}`: {e}")))?;
-        if raw.len() > limit {
-            return Err(ReadError::TooLarge { needed: raw.len(), limit });
-        }
+        budget.holds(raw.len(), 1)?;
         let array = read_npy_within(&raw, &mut budget).map_err(|e| match e {
             ReadError::Malformed { reason, .. } => broken(&format!("`{name}`: {reason}")),
             other => other,
@@ -222,12 +220,13 @@ pub fn header(shape: &[usize]) -> Vec<u8> {
     bytes
 }
 
-/// Writes named arrays as a compressed `.npz`.
+/// Writes named arrays as an uncompressed `.npz`: masks and video unpack to many times their compressed size, which [`read_npz`]
+/// would refuse of a large scene.
 ///
 /// # Errors
 /// The writer's error.
 pub fn write_npz(w: impl Write + Seek, arrays: &[(&str, ArrayViewD<'_, f32>)]) -> Result<(), WriteNpzError> {
-    let mut npz = NpzWriter::new_compressed(w);
+    let mut npz = NpzWriter::new(w);
     for (name, array) in arrays {
         npz.add_array(*name, array)?;
     }
@@ -319,17 +318,38 @@ mod tests {
 
     #[test]
     fn damaged_archives_give_errors() {
-        let mut bytes = Cursor::new(Vec::new());
-        let a = ramp().into_dyn();
-        write_npz(&mut bytes, &[("mask", a.view())]).unwrap();
-        let bytes = bytes.into_inner();
-        for len in 0..bytes.len() {
-            assert!(read_npz(&bytes[..len], &["mask"]).is_err(), "{len} bytes");
+        let mut plain = Cursor::new(Vec::new());
+        write_npz(&mut plain, &[("mask", ramp().into_dyn().view())]).unwrap();
+        let mut deflated = NpzWriter::new_compressed(Cursor::new(Vec::new()));
+        deflated.add_array("mask", &ramp()).unwrap();
+        for bytes in [plain.into_inner(), deflated.finish().unwrap().into_inner()] {
+            assert!(read_npz(&bytes, &["mask"]).is_ok());
+            for len in 0..bytes.len() {
+                assert!(read_npz(&bytes[..len], &["mask"]).is_err(), "{len} bytes");
+            }
+            for at in 0..bytes.len() {
+                let mut b = bytes.clone();
+                b[at] ^= 0xff;
+                let _ = read_npz(&b, &["mask"]);
+            }
         }
-        for at in 0..bytes.len() {
-            let mut b = bytes.clone();
-            b[at] ^= 0xff;
-            let _ = read_npz(&b, &["mask"]);
+    }
+
+    #[test]
+    fn what_unpacks_to_too_much_is_refused_with_the_limit_of_its_file() {
+        let mut npz = NpzWriter::new_compressed(Cursor::new(Vec::new()));
+        let zeros = Array3::<f32>::zeros((20, 1024, 1024));
+        npz.add_array("mask", &zeros).unwrap();
+        let bytes = npz.finish().unwrap().into_inner();
+        match read_npz(&bytes, &["mask"]) {
+            Err(ReadError::TooLarge { needed, limit }) => {
+                assert_eq!(limit, Budget::for_file(bytes.len()).left());
+                assert!(needed > limit);
+            }
+            other => panic!("{other:?}"),
         }
+        let mut stored = Cursor::new(Vec::new());
+        write_npz(&mut stored, &[("mask", zeros.into_dyn().view())]).unwrap();
+        assert!(read_npz(stored.get_ref(), &["mask"]).is_ok(), "our own files are read whatever is in them");
     }
 }

@@ -38,19 +38,21 @@ impl Budget {
     /// Claims `count` items of `size` bytes.
     ///
     /// # Errors
-    /// [`ReadError::TooLarge`] if that is more than is left (or overflows).
+    /// As [`Budget::holds`].
     pub fn claim(&mut self, count: usize, size: usize) -> Result<(), ReadError> {
-        let needed = count.checked_mul(size).filter(|&n| n <= self.left);
-        match needed {
-            Some(n) => {
-                self.left -= n;
-                Ok(())
-            }
-            None => Err(ReadError::TooLarge {
-                needed: count.saturating_mul(size).saturating_add(self.limit - self.left),
-                limit: self.limit,
-            }),
-        }
+        self.left -= self.holds(count, size)?;
+        Ok(())
+    }
+
+    /// The bytes of `count` items of `size` bytes, which are not claimed.
+    ///
+    /// # Errors
+    /// [`ReadError::TooLarge`] if that is more than is left (or overflows).
+    pub fn holds(&self, count: usize, size: usize) -> Result<usize, ReadError> {
+        count.checked_mul(size).filter(|&n| n <= self.left).ok_or_else(|| ReadError::TooLarge {
+            needed: count.saturating_mul(size).saturating_add(self.limit - self.left),
+            limit: self.limit,
+        })
     }
 }
 

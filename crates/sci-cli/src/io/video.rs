@@ -5,19 +5,21 @@ use std::io::{self, Cursor, Read, Write};
 use std::path::PathBuf;
 
 use image::{AnimationDecoder, ImageDecoder, Limits, codecs::gif::GifDecoder};
-use ndarray::{ArrayView3, ArrayView4, Axis};
+use ndarray::{ArrayView3, ArrayView4};
 use rayon::prelude::*;
 
 use super::ReadError;
-use super::frames::{push_planes, to_byte};
+use super::frames::{push_planes, to_byte, to_pixels};
 use super::samples::{Array, Budget, SampleType, Samples};
 
 const GIF: &str = ".gif";
 const Y4M: &str = ".y4m";
 /// Longest side accepted, so that no product of sizes can overflow.
 const MAX_SIDE: usize = 1 << 16;
-/// How coarsely the colors of a GIF's frame are sampled for its palette, 1 to 30.
-const PALETTE_SPEED: i32 = 10;
+/// The pixels of a video that the palette of its GIF is made of; a side of a frame can be as long.
+const SAMPLE: usize = 1 << 15;
+/// How coarsely these are sampled once more, 1 to 30.
+const PALETTE_SPEED: i32 = 4;
 /// The last byte of a GIF.
 const GIF_END: u8 = 0x3b;
 
@@ -231,7 +233,7 @@ impl Ycc {
 
 /// Writes a video `[T, C, H, W]`, C = 1 or 3, samples in `[0, 1]`, as an endless animated GIF of `fps` frames a second.
 ///
-/// Gray video keeps all 256 levels; color is reduced to 256 colors a frame.
+/// Gray video keeps all 256 levels; color is reduced to 256 colors, the same for all frames.
 ///
 /// # Errors
 /// The encoder's or the writer's error; a side above 65535 pixels.
@@ -242,15 +244,24 @@ pub fn write_gif(w: impl Write, video: ArrayView4<'_, f32>, fps: u16) -> Result<
     };
     let (height, width) = (side(height)?, side(width)?);
     let ramp: Vec<u8> = (0..=255).flat_map(|g| [g; 3]).collect();
-    let palette: &[u8] = if channels == 1 { &ramp } else { &[] };
-    let mut encoder = gif::Encoder::new(w, width, height, palette)?;
+    let palette = (channels == 3).then(|| Palette::of(video));
+    // Colors go with each frame, so that GIFs can be joined.
+    let mut encoder = gif::Encoder::new(w, width, height, if palette.is_none() { &ramp } else { &[] })?;
     encoder.set_repeat(gif::Repeat::Infinite)?;
     let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
     let encoded: Vec<gif::Frame<'static>> = frames
         .par_iter()
         .map(|frame| {
-            let mut gif_frame = gif_frame(*frame, width, height);
-            gif_frame.delay = 100 / fps.max(1);
+            let pixels = to_pixels(*frame);
+            let indices = palette.as_ref().map(|palette| palette.indices(&pixels));
+            let mut gif_frame = gif::Frame {
+                width,
+                height,
+                delay: 100 / fps.max(1),
+                buffer: indices.unwrap_or(pixels).into(),
+                palette: palette.as_ref().map(|palette| palette.colors.clone()),
+                ..Default::default()
+            };
             gif_frame.make_lzw_pre_encoded();
             gif_frame
         })
@@ -258,14 +269,57 @@ pub fn write_gif(w: impl Write, video: ArrayView4<'_, f32>, fps: u16) -> Result<
     encoded.iter().try_for_each(|frame| encoder.write_lzw_pre_encoded_frame(frame))
 }
 
-fn gif_frame(frame: ArrayView3<'_, f32>, width: u16, height: u16) -> gif::Frame<'static> {
-    if frame.len_of(Axis(0)) == 1 {
-        let levels: Vec<u8> = frame.iter().map(|&x| to_byte(x)).collect();
-        gif::Frame { width, height, buffer: levels.into(), ..Default::default() }
-    } else {
-        let rgb: Vec<u8> = frame.permuted_axes([1, 2, 0]).iter().map(|&x| to_byte(x)).collect();
-        gif::Frame::from_rgb_speed(width, height, &rgb, PALETTE_SPEED)
+/// The colors of a video's GIF. Making 256 colors is the slow part, so they are made once, of a sample; and which of them is
+/// nearest is asked once for each cell of a grid, not for each pixel.
+struct Palette {
+    /// RGB, one after the other.
+    colors: Vec<u8>,
+    /// The nearest color of each cell.
+    nearest: Vec<u8>,
+}
+
+impl Palette {
+    /// Cells of the grid along each of the three axes, as a power of two.
+    const BITS: usize = 5;
+
+    fn of(video: ArrayView4<'_, f32>) -> Self {
+        let (frames, _, height, width) = video.dim();
+        // Odd, so that an even width does not make it a few columns.
+        let step = (frames * height * width).div_ceil(SAMPLE) | 1;
+        let places = (0..frames * height * width).step_by(step);
+        let pixel = |i: usize| {
+            let (t, y, x) = (i / width / height, i / width % height, i % width);
+            [0, 1, 2].map(|c| to_byte(video[[t, c, y, x]]))
+        };
+        let sample: Vec<u8> = places.flat_map(pixel).collect();
+        // The crate's quantiser is at hand only in the shape of a frame.
+        let frame = gif::Frame::from_rgb_speed((sample.len() / 3) as u16, 1, &sample, PALETTE_SPEED);
+        let colors = frame.palette.unwrap_or_default();
+        let cells = 0..1usize << (3 * Self::BITS);
+        let nearest = cells.map(|cell| nearest(&colors, Self::middle(cell))).collect();
+        Self { colors, nearest }
     }
+
+    /// The color in the middle of a cell.
+    fn middle(cell: usize) -> [i32; 3] {
+        let half = 1 << (7 - Self::BITS);
+        [2, 1, 0]
+            .map(|axis| ((cell >> (axis * Self::BITS)) & ((1 << Self::BITS) - 1)) << (8 - Self::BITS) | half)
+            .map(|level| level as i32)
+    }
+
+    fn indices(&self, pixels: &[u8]) -> Vec<u8> {
+        let cell =
+            |rgb: &[u8; 3]| rgb.iter().fold(0, |cell, &v| cell << Self::BITS | usize::from(v) >> (8 - Self::BITS));
+        pixels.as_chunks::<3>().0.iter().map(|rgb| self.nearest[cell(rgb)]).collect()
+    }
+}
+
+/// Which of the colors, at most 256, is nearest.
+fn nearest(colors: &[u8], to: [i32; 3]) -> u8 {
+    let distance = |color: &[u8; 3]| (0..3).map(|c| (i32::from(color[c]) - to[c]).pow(2)).sum::<i32>();
+    let distances = colors.as_chunks::<3>().0.iter().map(distance).enumerate();
+    distances.min_by_key(|(_, distance)| *distance).map_or(0, |(index, _)| index as u8)
 }
 
 /// Writes the GIF of several, which [`write_gif`] made of videos of one size, one after the other.
@@ -295,7 +349,7 @@ fn gif_head(bytes: &[u8]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array4;
+    use ndarray::{Array4, Axis};
 
     #[test]
     fn gray_gif_round_trip_is_exact() {
@@ -309,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn joined_gifs_are_the_gif_of_the_joined_videos() {
+    fn joined_gifs_show_the_joined_videos() {
         let dir = tempfile::tempdir().unwrap();
         for channels in [1, 3] {
             let video =
@@ -319,14 +373,42 @@ mod tests {
                 write_gif(&mut bytes, video, 10).unwrap();
                 bytes
             };
-            let parts: Vec<PathBuf> = (0..2).map(|i| dir.path().join(format!("{i}.gif"))).collect();
             let (first, second) = video.view().split_at(Axis(0), 2);
-            fs::write(&parts[0], gif(first)).unwrap();
-            fs::write(&parts[1], gif(second)).unwrap();
+            let single = [gif(first), gif(second)];
+            let parts: Vec<PathBuf> = (0..2).map(|i| dir.path().join(format!("{i}.gif"))).collect();
+            parts.iter().zip(&single).for_each(|(path, bytes)| fs::write(path, bytes).unwrap());
             let mut joined = Vec::new();
             join_gifs(&mut joined, &parts).unwrap();
-            assert!(joined == gif(video.view()), "{channels} channels");
+            let shown = |gif: &[u8]| read_gif(gif).unwrap().into_samples();
+            let mut expected = shown(&single[0]);
+            expected.append(shown(&single[1]));
+            assert_eq!(shown(&joined), expected, "{channels} channels");
         }
+    }
+
+    #[test]
+    fn a_few_colors_are_kept_and_many_are_near() {
+        let shown = |video: &Array4<f32>| {
+            let mut bytes = Vec::new();
+            write_gif(&mut bytes, video.view(), 10).unwrap();
+            read_gif(&bytes).unwrap()
+        };
+        // Levels in the middle of the grid's cells, fewer than 256 colors.
+        let few = Array4::from_shape_fn((2, 3, 4, 5), |(t, c, y, x)| (4 + 8 * (t + 3 * c + y + 2 * x)) as f32 / 255.0);
+        let read = shown(&few);
+        few.iter()
+            .enumerate()
+            .for_each(|(i, &v)| assert_eq!(read.samples().at(i), f32::from(to_byte(v)), "sample {i}"));
+        let many = Array4::from_shape_fn((2, 3, 100, 120), |(t, c, y, x)| match c {
+            0 => y as f32 / 99.0,
+            1 => x as f32 / 119.0,
+            _ => 0.3 + 0.2 * t as f32,
+        });
+        let read = shown(&many);
+        let off = many.iter().enumerate().map(|(i, v)| (255.0 * v - read.samples().at(i)).abs());
+        let (worst, mean) =
+            off.fold((0.0f32, 0.0), |(worst, sum), off| (worst.max(off), sum + off / many.len() as f32));
+        assert!(worst < 40.0 && mean < 8.0, "{worst} at worst, {mean} in the mean");
     }
 
     #[test]

@@ -3,12 +3,12 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::ImageError;
-use ndarray::{ArrayView2, ArrayView3, ArrayView4, Axis, Zip};
+use ndarray::{Array4, ArrayView2, ArrayView3, ArrayView4, Axis, Zip, s};
+use rayon::prelude::*;
 use sci_forward::CfaPattern;
 use serde::Serialize;
 
-use crate::io::frames;
-use crate::pictures::{halved_to, pngs};
+use crate::io::frames::{self, halved_to, longer_side, pngs};
 
 /// Frames are not made smaller than this, in pixels of the longer side, but left out.
 const SMALLEST: usize = 400;
@@ -71,7 +71,8 @@ impl Pictures {
         let step = step(&of_frame, limit.saturating_sub(taken));
         let shown = |pngs: Vec<Vec<u8>>| pngs.iter().step_by(step).map(|png| uri(png)).collect::<Vec<_>>();
         let psnr_db = images.truth.map_or_else(Vec::new, |truth| {
-            truth.outer_iter().zip(images.recon.outer_iter()).step_by(step).map(|(a, b)| psnr(a, b)).collect()
+            let shown: Vec<_> = truth.outer_iter().zip(images.recon.outer_iter()).step_by(step).collect();
+            shown.into_par_iter().map(|(truth, frame)| psnr(truth, frame)).collect()
         });
         let fits = step <= of_frame.len();
         Ok(Self {
@@ -87,23 +88,20 @@ impl Pictures {
     }
 }
 
-fn longer_side(video: ArrayView4<'_, f32>) -> usize {
-    video.len_of(Axis(2)).max(video.len_of(Axis(3)))
-}
-
 /// How much smaller the frames have to be for all to fit, by the size of the first; not so small that nothing is seen.
 fn shrink(images: &MeasurementImages<'_>, full: Option<&[Vec<u8>]>, limit: usize) -> Result<usize, ImageError> {
     let (frames, side) = (images.recon.len_of(Axis(0)), longer_side(images.recon));
     let videos = if images.truth.is_some() { 2 } else { 1 };
-    let mut frame = images.recon.index_axis(Axis(0), 0).to_owned();
+    let mut frame = images.recon.slice(s![..1, .., .., ..]).to_owned();
+    let encoded = |frame: &Array4<f32>| Ok::<_, ImageError>(uri_len(&frames::png(frame.index_axis(Axis(0), 0))?));
     let mut size = match full.and_then(<[_]>::first) {
         Some(png) => uri_len(png),
-        None => uri_len(&frames::png(frame.view())?),
+        None => encoded(&frame)?,
     };
     let mut shrink = 1;
     while size * frames * videos > limit && side / (2 * shrink) >= SMALLEST {
         frame = frames::halved(frame.view());
-        size = uri_len(&frames::png(frame.view())?);
+        size = encoded(&frame)?;
         shrink *= 2;
     }
     Ok(shrink)
@@ -115,7 +113,7 @@ fn step(sizes: &[usize], limit: usize) -> usize {
     (1..=sizes.len()).find(|&step| fits(step)).unwrap_or(sizes.len() + 1)
 }
 
-fn to_its_largest(y: ArrayView2<'_, f32>) -> ndarray::Array4<f32> {
+fn to_its_largest(y: ArrayView2<'_, f32>) -> Array4<f32> {
     let brightest = y.iter().fold(0.0f32, |a, &b| a.max(b));
     let scale = if brightest > 0.0 { 1.0 / brightest } else { 1.0 };
     y.mapv(|v| v * scale).insert_axis(Axis(0)).insert_axis(Axis(0))
@@ -142,7 +140,6 @@ fn uri_len(png: &[u8]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array4;
 
     fn noise(frames: usize, side: usize) -> Array4<f32> {
         let mut state = 1u32;

@@ -80,6 +80,12 @@ pub(super) fn refuse_foreign(dir: &Path, files: &[String], ours: &BTreeSet<Strin
     });
     match foreign {
         None => Ok(()),
+        // A record of this version lists at least the result.
+        Some(name) if exists(RECORD) && ours.is_empty() => Err(Refusal(format!(
+            "--out {}: it holds `{name}` and the {RECORD} of an earlier version, which does not list the files of its run; \
+             to replace that run remove the folder first, or name another one",
+            dir.display()
+        ))),
         Some(name) => Err(Refusal(format!(
             "--out {}: it holds `{name}`, which no {RECORD} there lists as the result of a run; move it away or name another folder",
             dir.display()

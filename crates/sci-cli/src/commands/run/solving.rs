@@ -115,12 +115,12 @@ fn measurement_record(
 
 /// Mean over the frames of the PSNR over all three colors, `[T, 3, H, W]`.
 fn psnr_rgb(truth: ArrayView4<'_, f32>, video: ArrayView4<'_, f32>) -> f64 {
+    let (t, c, h, w) = truth.dim();
     // The colors of a frame one below the other are one image of three times the height.
-    let stacked = |v: ArrayView4<'_, f32>| {
-        let (t, c, h, w) = v.dim();
-        v.as_standard_layout().into_owned().into_shape_with_order((t, c * h, w)).expect("the same number of pixels")
-    };
-    mean_over_frames(stacked(truth).view(), stacked(video).view(), psnr)
+    let stacked = (t, c * h, w);
+    let (truth, video) = (truth.to_shape(stacked), video.to_shape(stacked));
+    let same = "the same number of pixels";
+    mean_over_frames(truth.expect(same).view(), video.expect(same).view(), psnr)
 }
 
 fn line(m: &MeasurementRecord) -> String {
