@@ -4,6 +4,7 @@
 //! here. What is read is in range, complete and has an effect, so that no other code has to doubt a value; an error names the file and
 //! line (or the `--set` argument), the key, the value and what is legal.
 
+pub mod camera;
 mod data;
 mod online;
 mod output;
