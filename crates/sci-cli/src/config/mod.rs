@@ -330,8 +330,7 @@ mod tests {
             "convention": "paper-code", "demosaicer": null,
         });
         assert_eq!((&shown["name"], &shown["solver"]), (&json!("a"), &solver));
-        let denoiser =
-            json!({ "kind": "fastdvdnet", "weights": "b", "precision": "f32", "flips": false, "ends": "circular" });
+        let denoiser = json!({ "kind": "fastdvdnet", "weights": "b", "precision": "f32", "flips": false, "dim": 1.0, "ends": "circular" });
         assert_eq!(shown["denoisers"], json!([denoiser]));
         assert_eq!(shown["stage"], json!([{ "sigma": 0.2f32, "iterations": 3, "denoiser": 0 }]));
         let interval = ::online::AdaptConfig::default().schedule.interval;

@@ -30,11 +30,11 @@ impl Online {
     /// Nothing if it is switched off.
     pub(super) fn read(t: &mut Table<'_>, seed: u64, denoisers: &[Chosen]) -> Option<Self> {
         let enabled = t.flag("enabled", true);
-        let flips = |d: &Chosen| d.part.network().is_some_and(|network| network.flips);
-        if enabled && denoisers.iter().any(flips) {
+        let otherwise = |d: &Chosen| d.part.network().is_some_and(|network| network.flips || network.dim != 1.0);
+        if enabled && denoisers.iter().any(otherwise) {
             t.complain(
                 "[online] compares what a network gives with the measurement, so that it must see the video the right way \
-                 round; legal: denoiser.flips = false, or online.enabled = false",
+                 round and as bright as it is; legal: denoiser.flips = false with denoiser.dim = 1, or online.enabled = false",
             );
         }
         let presets = [
