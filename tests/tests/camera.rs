@@ -68,6 +68,10 @@ fn masks_that_sit_elsewhere_are_found_and_used() {
     let (by_masks, _) = run(&bench, &["data.mask=cal/masks.npy"]);
     assert!(by_file > off + 3.0 && (by_file - by_masks).abs() < 1.0, "{off} {by_file} {by_masks}");
     assert!((calibration["shift"][1].as_f64().unwrap() - 1.0).abs() < 0.1, "{calibration}");
+    // What was beyond the edge of the masks that were told is not guessed: it counts as not measured.
+    let found: ndarray::Array3<f32> = ndarray_npy::read_npy(bench.path("cal/masks.npy")).unwrap();
+    let open = |column: usize| found.index_axis(ndarray::Axis(2), column).sum();
+    assert!(open(0) == 0.0 && open(1) > 10.0 && open(47) > 10.0, "{} {} {}", open(0), open(1), open(47));
     let broken = bench.sci(&["run", "a.toml", "--out", "b", "--set", "data.calibration=scene.npz"]);
     assert_eq!(broken.code, 1);
     assert!(
@@ -75,6 +79,85 @@ fn masks_that_sit_elsewhere_are_found_and_used() {
         "{}",
         broken.stderr
     );
+}
+
+/// The same camera by arguments of `sci simulate` and by `[data.camera]`.
+#[test]
+fn a_camera_with_faults_is_simulated_alike_by_both_ways() {
+    let faults =
+        ["shift=[0.4,-0.3]", "contrast=0.9", "flicker=0.05", "black=0.05", "bits=10", "dead=0.004", "hot=0.004"];
+    let arguments: Vec<&str> = faults.iter().flat_map(|fault| ["--set", fault]).collect();
+    let bench = bench(&arguments);
+    let (file, record) = run(&bench, &[]);
+    assert!(record["config"]["data"]["camera"].is_null());
+    let mut settings: Vec<String> = faults.iter().map(|fault| format!("data.camera.{fault}")).collect();
+    settings.extend(
+        [
+            "data.kind=simulate",
+            "data.path=video.y4m",
+            "data.mask={kind=\"random\", frames=6, seed=3}",
+            "data.noise.seed=3",
+        ]
+        .map(String::from),
+    );
+    let settings: Vec<&str> = settings.iter().map(String::as_str).collect();
+    let (simulated, record) = run(&bench, &settings);
+    assert_eq!(file, simulated);
+    assert_eq!(record["config"]["data"]["camera"]["bits"], 10);
+    // Without what is wrong with it, and with that told, it is better.
+    let clean: Vec<&str> = settings.iter().filter(|set| !set.starts_with("data.camera")).copied().collect();
+    let told = [&settings[..], &["data.sensor.black=0.05", "data.defects=exclude"]].concat();
+    let (clean, told) = (run(&bench, &clean).0, run(&bench, &told).0);
+    assert!(clean > told && told > file + 0.3, "{clean} {told} {file}");
+}
+
+#[test]
+fn a_camera_that_cannot_be_is_refused() {
+    let bench = bench(&[]);
+    for (command, set, part) in [
+        ("simulate", "gain=0", "a number from 0.000001 to 1000000"),
+        ("simulate", "shift=[1]", "two numbers from -64 to 64"),
+        ("simulate", "colour=red", "unknown key `colour`"),
+        ("mask", "black=0.1", "unknown key `black`"),
+    ] {
+        let mut args = vec![command, "--out", "x.npz", "--set", set];
+        if command == "simulate" {
+            args.push("video.y4m");
+        }
+        let run = bench.sci(&args);
+        assert!(run.code == 2 && run.stderr.contains(part), "{set}: {} {}", run.code, run.stderr);
+    }
+}
+
+#[test]
+fn masks_are_made_as_optics_show_them() {
+    let bench = Bench::new();
+    let make = |out: &str, sets: &[&str]| -> ndarray::Array3<f32> {
+        let run = bench.sci(&[&["mask", "--out", out, "--frames", "3", "--size", "20x30"], sets].concat());
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        ndarray_npy::read_npy(bench.path(out)).unwrap()
+    };
+    let (told, moved) = (make("a.npy", &[]), make("b.npy", &["--set", "shift=[0,2]"]));
+    assert_eq!(moved.slice(ndarray::s![.., .., 2..]), told.slice(ndarray::s![.., .., ..28]));
+    let flickering = make("c.npy", &["--set", "flicker=0.1"]);
+    assert!((0..3).all(|t| flickering.index_axis(ndarray::Axis(0), t) != told.index_axis(ndarray::Axis(0), t)));
+}
+
+/// The presets for captured data, on a camera with faults.
+#[test]
+fn the_presets_for_cameras_run() {
+    let bench = bench(&["--set", "shift=[0.5,0.25]", "--set", "black=0.05", "--set", "hot=0.001", "--sigma", "2"]);
+    for (config, sets) in [("real/gray", &[][..]), ("real/color", &["--set", "data.cfa=rggb"])] {
+        let config = e2e::workspace().join(format!("configs/{config}.toml"));
+        let config = config.to_str().unwrap();
+        let base = ["run", config, "--out", "out", "--set", "data.path=scene.npz", "--set", "output=minimal"];
+        let run = bench.sci(&[&base, sets].concat());
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        let record = bench.record("out");
+        assert!(record["calibration"]["solves"].as_u64().unwrap() > 50, "{record}");
+        let psnr = record["mean"]["psnr_db"].as_f64().unwrap();
+        assert!(psnr > 20.0, "{config}: {psnr}");
+    }
 }
 
 #[test]
@@ -133,4 +216,52 @@ fn the_unit_of_masks_does_not_matter() {
         let off = (recon(unit, gain) - &first).fold(0f32, |m, d| m.max(d.abs()));
         assert!(off < 1e-3, "masks × {unit}, y × {gain}: {off}");
     }
+}
+
+/// With a truth in the file, neither the unit of the measurements nor that of the masks makes a difference.
+#[test]
+fn the_unit_of_measurements_does_not_matter() {
+    let bench = bench(&[]);
+    let read = |name: &str| {
+        let mut scene = ndarray_npy::NpzReader::new(fs::File::open(bench.path("scene.npz")).unwrap()).unwrap();
+        scene.by_name::<ndarray::OwnedRepr<f32>, ndarray::Ix3>(name).unwrap()
+    };
+    let (mask, meas, orig) = (read("mask"), read("meas"), read("orig"));
+    let psnr = |of_masks: f32, of_y: f32| {
+        let mut file = ndarray_npy::NpzWriter::new(fs::File::create(bench.path("unit.npz")).unwrap());
+        file.add_array("mask", &(&mask * of_masks)).unwrap();
+        file.add_array("meas", &(&meas * of_y)).unwrap();
+        file.add_array("orig", &orig).unwrap();
+        file.finish().unwrap();
+        run(&bench, &["data.path=unit.npz"]).0
+    };
+    let first = psnr(1.0, 1.0);
+    for (of_masks, of_y) in
+        [(1.0, 1e-3), (1.0, 0.1), (1.0, 0.7), (1.0, 30.0), (1.0, 1e3), (0.1, 1.0), (100.0, 2.0), (255.0, 1e3)]
+    {
+        let off = psnr(of_masks, of_y) - first;
+        assert!(off.abs() < 0.05, "masks × {of_masks}, y × {of_y}: {off}");
+    }
+}
+
+#[test]
+fn small_negative_transmittances_are_clipped_with_a_word() {
+    let bench = bench(&[]);
+    let made = bench.sci(&["mask", "--out", "mask.npy", "--frames", "6", "--size", "48x48", "--seed", "3"]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    let mask: ndarray::Array3<f32> = ndarray_npy::read_npy(bench.path("mask.npy")).unwrap();
+    let write =
+        |dark: f32| ndarray_npy::write_npy(bench.path("dark.npy"), &mask.mapv(|c| if c == 0.0 { dark } else { c }));
+    write(-0.02).unwrap();
+    let args = ["run", "a.toml", "--out", "out", "--set", "data.mask=dark.npy", "--set", "output=minimal"];
+    let clipped = bench.sci(&args);
+    assert!(
+        clipped.code == 0 && clipped.stderr.contains("transmittances below 0, down to -0.02"),
+        "{}",
+        clipped.stderr
+    );
+    assert_eq!(bench.record("out")["mean"]["psnr_db"].as_f64().unwrap(), run(&bench, &[]).0);
+    write(-1.0).unwrap();
+    let refused = bench.sci(&args);
+    assert!(refused.code == 1 && refused.stderr.contains("mask value -1"), "{}", refused.stderr);
 }

@@ -7,6 +7,7 @@ mod circles;
 mod pareto;
 mod plot;
 mod repro;
+mod robust;
 mod sensitivity;
 mod stress;
 mod tidy;
@@ -42,6 +43,8 @@ enum Bench {
     Pareto(pareto::Options),
     /// The paper's figure of parameters: schedules and numbers of online updates
     Sensitivity(sensitivity::Options),
+    /// The faults of real cameras, one at a time and together, with and without calibration
+    Robust(robust::Options),
 }
 
 fn main() -> anyhow::Result<()> {
@@ -55,5 +58,6 @@ fn main() -> anyhow::Result<()> {
         Task::Bench(Bench::Kernels(options)) => bench::kernels(&options),
         Task::Bench(Bench::Pareto(options)) => pareto::run(&options),
         Task::Bench(Bench::Sensitivity(options)) => sensitivity::run(&options),
+        Task::Bench(Bench::Robust(options)) => robust::run(&options),
     }
 }

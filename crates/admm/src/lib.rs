@@ -37,9 +37,9 @@ mod solvers;
 mod start;
 
 pub use adapters::{
-    Clipped, Demosaicked, Flips, PerLattice, PerStage, TileCounter, TileCounts, Tiles, flipped_axes, still,
+    Clipped, Demosaicked, Dimmed, Flips, PerLattice, PerStage, TileCounter, TileCounts, Tiles, flipped_axes, still,
 };
-pub use calibrate::{CalibrateError, Calibrated, Calibration, Parameter};
+pub use calibrate::{CalibrateError, Calibrated, Calibration, Exposure, Parameter};
 pub use calibrate::{Progress as CalibrationProgress, Watch as CalibrationWatch};
 pub use data_step::{DataStep, Progress, progress};
 pub use priors::{Call, Denoiser, Estimate, Prior, PriorError, Tv, Wnnm};

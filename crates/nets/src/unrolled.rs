@@ -7,8 +7,8 @@
 use crate::kernels::with_numbers;
 use crate::{Error, Network, Result};
 use admm::{
-    BoxError, Call, Demosaicked, Denoiser, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start, Tv, flipped_axes,
-    run,
+    BoxError, Call, Demosaicked, Denoiser, Dimmed, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start, Tv,
+    flipped_axes, run,
 };
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
@@ -28,6 +28,8 @@ pub struct Recipe {
     pub start: Option<(usize, f32)>,
     /// Whether the network sees the video another way round in every call ([`Flips`]).
     pub flips: bool,
+    /// It sees the video divided by this ([`Dimmed`]), which is above 0.
+    pub dim: f32,
 }
 
 /// A call of the network in a solve.
@@ -115,7 +117,8 @@ impl Recipe {
     }
 
     fn turning<'d>(&self, denoiser: &'d mut dyn Denoiser) -> Box<dyn Denoiser + 'd> {
-        if self.flips { Box::new(Flips::new(denoiser)) } else { Box::new(denoiser) }
+        let turning: Box<dyn Denoiser> = if self.flips { Box::new(Flips::new(denoiser)) } else { Box::new(denoiser) };
+        if self.dim == 1.0 { turning } else { Box::new(Dimmed::new(turning, self.dim)) }
     }
 
     fn solve_calls(
@@ -193,10 +196,11 @@ impl Recipe {
         Ok(total)
     }
 
-    /// The result of a call, which sees its input as [`Flips`] turns it.
+    /// The result of a call, which sees its input as [`Flips`] turns it, in less light.
     fn denoised(&self, network: &dyn Network, input: &Tensor, call: &RecordedCall) -> Result<Tensor> {
         let axes: Vec<usize> = flipped_axes(call.iteration).filter(|_| self.flips).map(|axis| axis.index()).collect();
-        Ok(network.forward(&input.flip(&axes)?, &[call.sigma])?.flip(&axes)?)
+        let (less, more) = (f64::from(1.0 / self.dim), f64::from(self.dim));
+        Ok((network.forward(&(input * less)?.flip(&axes)?, &[call.sigma])?.flip(&axes)? * more)?)
     }
 
     /// From the gradient by the input of a call to that by the result of the call before, both `[T, C, H, W]`.
@@ -342,7 +346,7 @@ mod tests {
         let spec = FfdnetSpec { channels, width: 8, depth: 3, layout: FfdnetLayout::Residual { batch_norm: false } };
         let mut net = Ffdnet::random(spec, 1).unwrap();
         let sigmas = [40.0, 30.0, 20.0].map(|sigma| sigma / 255.0).to_vec();
-        let recipe = Recipe { sigmas, accelerate, start: None, flips: true };
+        let recipe = Recipe { sigmas, accelerate, start: None, flips: true, dim: 1.3 };
         let (measurement, vars) = (measured(&clip), net.make_trainable().unwrap());
         let squared = |v: ArrayView4<'_, f32>| {
             let error = &v - &clip;

@@ -35,7 +35,7 @@ fn net(channels: usize) -> Ffdnet {
 }
 
 fn recipe() -> Recipe {
-    Recipe { sigmas: vec![0.2, 0.1, 0.05], accelerate: true, start: Some((5, 0.1)), flips: true }
+    Recipe { sigmas: vec![0.2, 0.1, 0.05], accelerate: true, start: Some((5, 0.1)), flips: true, dim: 1.5 }
 }
 
 /// A moving square, of a color sensor if there is a pattern.

@@ -4,8 +4,9 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
+use admm::Exposure;
 use anyhow::Context;
-use ndarray::Array2;
+use ndarray::{Array2, Zip};
 use sci_forward::{MaskMismatch, MaskOperator, MaskStack};
 use serde::{Deserialize, Serialize};
 
@@ -17,6 +18,10 @@ use crate::progress::Progress;
 const SCHEMA: u32 = 1;
 /// Measurements that are looked at, at most: each makes every try so much longer.
 const MOST_MEASUREMENTS: usize = 3;
+
+/// Pixels that masks open for less than this share of the usual are left out: their light is little beside what is not known of the masks,
+/// and divided by as little.
+const HARDLY_OPEN: f32 = 0.2;
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,6 +40,12 @@ pub struct Calibration {
     ends: [f64; 2],
     /// To be taken off the measurements, in units of white.
     black: f64,
+    /// Light before the first frame, of each frame, and after the last; nothing where all frames get as much.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    exposure: Option<Vec<f64>>,
+    /// One standard deviation of the least certain of these.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    exposure_uncertainty: Option<f64>,
     /// Share of the held-out pixels' power that is not predicted, with the masks as told and as found.
     pub error_before: f64,
     /// The same, as found.
@@ -90,6 +101,12 @@ pub fn find(
     Ok(Calibration::of(found.context("calibration")?))
 }
 
+fn median(image: &Array2<f32>) -> f32 {
+    let mut values: Vec<f32> = image.iter().copied().collect();
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
+
 fn masks_of(scene: &Scene) -> anyhow::Result<MaskStack> {
     let source = scene.operator.masks().context("the scene has no masks to calibrate")?;
     Ok(MaskStack::from_source(source)?)
@@ -97,7 +114,7 @@ fn masks_of(scene: &Scene) -> anyhow::Result<MaskStack> {
 
 impl Calibration {
     fn of(found: admm::Calibrated) -> Self {
-        let MaskMismatch { shift, rotation, scale, clock, contrast, ends } = found.mismatch;
+        let MaskMismatch { shift, rotation, scale, clock, contrast, ends, .. } = found.mismatch;
         let parameters = found.parameters.into_iter().map(|p| Parameter {
             name: p.name.to_owned(),
             value: p.value,
@@ -114,6 +131,8 @@ impl Calibration {
             contrast,
             ends,
             black: found.black,
+            exposure_uncertainty: found.exposure.as_ref().map(|e| e.uncertainty),
+            exposure: found.exposure.map(|e| e.gains),
             error_before: found.error[0],
             error_after: found.error[1],
             parameters: parameters.collect(),
@@ -145,15 +164,30 @@ impl Calibration {
     /// How masks differ from those told.
     pub fn mismatch(&self) -> MaskMismatch {
         let Self { shift, rotation, scale, clock, contrast, ends, .. } = *self;
-        MaskMismatch { shift, rotation, scale, clock, contrast, ends }
+        MaskMismatch { shift, rotation, scale, clock, contrast, ends, ..MaskMismatch::default() }
     }
 
-    /// The masks as they are.
+    /// The masks as they are; closed where that comes from beyond the edge of those told, and where they are hardly open, so that what is
+    /// measured there is left out.
     ///
     /// # Errors
     /// If nothing of them is left open.
     pub fn masks(&self, scene: &Scene) -> anyhow::Result<MaskStack> {
-        Ok(self.mismatch().apply(&masks_of(scene)?)?)
+        let mismatch = self.mismatch();
+        let moved = mismatch.apply(&masks_of(scene)?)?;
+        let known = mismatch.reach(moved.shape().image_dim());
+        let exposed = match &self.exposure {
+            Some(gains) => Exposure { gains: gains.clone(), uncertainty: 0.0 }.apply(&moved)?,
+            None => moved,
+        };
+        let open = exposed.sum();
+        let least = HARDLY_OPEN * median(&open);
+        let told = Zip::from(&known).and(&open).map_collect(|&known, &open| known && open >= least);
+        let mut masks = exposed.view().to_owned();
+        for mut mask in masks.outer_iter_mut() {
+            mask.zip_mut_with(&told, |c, &told| *c = if told { *c } else { 0.0 });
+        }
+        Ok(MaskStack::new(masks)?)
     }
 
     /// Gives a scene the masks as they are, and takes the black level off its measurements.
@@ -177,6 +211,11 @@ impl Calibration {
             };
             format!("{:<12} {value}{}", p.name, if p.told_apart { "" } else { "   as told" })
         };
-        self.parameters.iter().map(line).collect()
+        let exposure = self.exposure.iter().map(|gains| {
+            let gains: Vec<String> = gains.iter().map(|gain| format!("{gain:.2}")).collect();
+            let uncertainty = self.exposure_uncertainty.unwrap_or(0.0);
+            format!("{:<12} {} ± {uncertainty:.2} (before, of each frame, after)", "light", gains.join(" "))
+        });
+        self.parameters.iter().map(line).chain(exposure).collect()
     }
 }

@@ -41,6 +41,7 @@ pub mod metrics;
 mod mismatch;
 mod noise;
 mod operator;
+mod readout;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
 
@@ -51,6 +52,7 @@ pub use measurement::{Measurement, MeasurementError};
 pub use mismatch::MaskMismatch;
 pub use noise::{Noise, NoiseError};
 pub use operator::{Restricted, SensingOperator};
+pub use readout::{Readout, ReadoutError};
 
 /// The error type at the seams where a plug-in (a denoiser, a demosaicer, an observer) reports to code that cannot know its errors.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync + 'static>;

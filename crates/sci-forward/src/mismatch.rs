@@ -2,13 +2,14 @@
 
 use crate::{MaskError, MaskStack};
 use ndarray::parallel::prelude::*;
-use ndarray::{Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axis, Zip};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis, Zip};
 
 /// What makes the masks on a sensor others than those that were calibrated: they sit elsewhere, are seen at the wrong time, or with
 /// less contrast. The default changes nothing.
 ///
 /// ```text
 /// moved    S_t(p) = C_t(R⁻¹ (p − centre − shift) / scale + centre)          bilinear, the edge continued
+/// blur     S_t ← S_t ∗ Gaussian of this standard deviation                  the edge continued
 /// clock    S_t ← (1 − c) S_t + c S_{t−1}   (c < 0: |c| of S_{t+1})          the frame before (after) is still (already) seen
 /// contrast S_t ← q S_t + (1 − q) mean(S_t)
 /// ends     S_0 ← S_0 + e₀,  S_{B−1} ← S_{B−1} + e₁                          light before the first frame and after the last
@@ -34,6 +35,8 @@ pub struct MaskMismatch {
     pub rotation: f64,
     /// About the centre; 1 leaves the size.
     pub scale: f64,
+    /// Standard deviation of the blur, in pixels, 0 to 16; 0 is none.
+    pub blur: f64,
     /// Share of the neighbouring frame, -1 to 1; of the frame before if positive.
     pub clock: f64,
     /// What is left of the differences to a mask's mean; 1 leaves all.
@@ -44,7 +47,7 @@ pub struct MaskMismatch {
 
 impl Default for MaskMismatch {
     fn default() -> Self {
-        Self { shift: [0.0; 2], rotation: 0.0, scale: 1.0, clock: 0.0, contrast: 1.0, ends: [0.0; 2] }
+        Self { shift: [0.0; 2], rotation: 0.0, scale: 1.0, blur: 0.0, clock: 0.0, contrast: 1.0, ends: [0.0; 2] }
     }
 }
 
@@ -55,6 +58,12 @@ impl MaskMismatch {
     /// [`MaskError`] if a value is then out of range (a parameter is not finite), or nothing is open.
     pub fn apply(&self, masks: &MaskStack) -> Result<MaskStack, MaskError> {
         let mut moved = self.moved(masks.view());
+        if self.blur != 0.0 {
+            let weights = gaussian(self.blur.abs().clamp(0.0, MAX_BLUR));
+            moved.outer_iter_mut().into_par_iter().for_each(|mut mask| {
+                (0..2).for_each(|axis| mask.lanes_mut(Axis(axis)).into_iter().for_each(|lane| smooth(lane, &weights)));
+            });
+        }
         if self.clock != 0.0 {
             moved = blended(&moved, self.clock as f32);
         }
@@ -74,6 +83,35 @@ impl MaskMismatch {
         MaskStack::new(moved)
     }
 
+    /// Where the masks that were told reach, of a sensor of `(H, W)` pixels: false where [`MaskMismatch::apply`] has to continue their edge,
+    /// by more than a tenth of a pixel. A mask there is a guess.
+    ///
+    /// ```
+    /// use sci_forward::MaskMismatch;
+    ///
+    /// let moved = MaskMismatch { shift: [0.0, 1.5], ..MaskMismatch::default() };
+    /// assert_eq!(moved.reach((1, 4)), ndarray::array![[false, false, true, true]]);
+    /// ```
+    pub fn reach(&self, (height, width): (usize, usize)) -> Array2<bool> {
+        let inside = |v: f64, n: usize| v >= -EDGE && v <= (n - 1) as f64 + EDGE;
+        let place = self.place((height, width));
+        Array2::from_shape_fn((height, width), |(i, j)| {
+            let [y, x] = place(i, j);
+            inside(y, height) && inside(x, width)
+        })
+    }
+
+    /// Where a pixel of the sensor is in the masks that were told, of `(H, W)` pixels.
+    fn place(&self, (height, width): (usize, usize)) -> impl Fn(usize, usize) -> [f64; 2] {
+        let centre = [height, width].map(|n| (n as f64 - 1.0) / 2.0);
+        let (sin, cos) = self.rotation.to_radians().sin_cos();
+        let ([sin, cos], shift) = ([sin / self.scale, cos / self.scale], self.shift);
+        move |i, j| {
+            let (y, x) = (i as f64 - centre[0] - shift[0], j as f64 - centre[1] - shift[1]);
+            [cos * y - sin * x + centre[0], sin * y + cos * x + centre[1]]
+        }
+    }
+
     fn moved(&self, masks: ArrayView3<'_, f32>) -> Array3<f32> {
         if (self.shift, self.rotation, self.scale) == ([0.0; 2], 0.0, 1.0) {
             return masks.to_owned();
@@ -85,15 +123,12 @@ impl MaskMismatch {
 
     fn move_frame(&self, from: ArrayView2<'_, f32>, mut to: ArrayViewMut2<'_, f32>) {
         let (height, width) = from.dim();
-        let centre = [height, width].map(|n| (n - 1) as f64 / 2.0);
-        let (sin, cos) = self.rotation.to_radians().sin_cos();
-        let [sin, cos] = [sin / self.scale, cos / self.scale];
+        let place = self.place((height, width));
         for (i, mut row) in to.outer_iter_mut().enumerate() {
-            let y = i as f64 - centre[0] - self.shift[0];
             for (j, value) in row.iter_mut().enumerate() {
-                let x = j as f64 - centre[1] - self.shift[1];
-                let (rows, down) = between(cos * y - sin * x + centre[0], height);
-                let (columns, across) = between(sin * y + cos * x + centre[1], width);
+                let [y, x] = place(i, j);
+                let (rows, down) = between(y, height);
+                let (columns, across) = between(x, width);
                 let at = |row: usize| {
                     let [a, b] = columns.map(|column| from[[row, column]]);
                     a + across * (b - a)
@@ -102,6 +137,30 @@ impl MaskMismatch {
                 *value = above + down * (below - above);
             }
         }
+    }
+}
+
+/// How far beyond its edge a mask is still known well enough, in pixels: a tenth of the difference to a neighbour may be wrong there.
+const EDGE: f64 = 0.1;
+/// The strongest blur, in pixels.
+const MAX_BLUR: f64 = 16.0;
+
+/// The right half of a Gaussian, the middle first, to three standard deviations; with the left half it adds up to 1.
+fn gaussian(sigma: f64) -> Vec<f64> {
+    let reach = (3.0 * sigma).ceil() as usize;
+    let half: Vec<f64> = (0..=reach).map(|d| (-0.5 * (d as f64 / sigma).powi(2)).exp()).collect();
+    let sum = 2.0 * half.iter().sum::<f64>() - half[0];
+    half.into_iter().map(|weight| weight / sum).collect()
+}
+
+/// A row or column blurred, its ends continued.
+fn smooth(mut lane: ArrayViewMut1<'_, f32>, weights: &[f64]) {
+    let sharp: Vec<f64> = lane.iter().map(|&c| f64::from(c)).collect();
+    let last = sharp.len() - 1;
+    for (i, value) in lane.iter_mut().enumerate() {
+        let beside = |d: usize| sharp[i.saturating_sub(d)] + sharp[(i + d).min(last)];
+        let sides: f64 = weights.iter().enumerate().skip(1).map(|(d, weight)| weight * beside(d)).sum();
+        *value = (weights[0] * sharp[i] + sides) as f32;
     }
 }
 
@@ -160,6 +219,29 @@ mod tests {
             let expected = plane((cos * y - sin * x) / 1.1, (sin * y + cos * x) / 1.1);
             assert!((turned.view()[[0, i, j]] - expected).abs() < 1e-4);
         }
+    }
+
+    #[test]
+    fn blur_keeps_the_light_and_spreads_it() {
+        let mut point = Array3::zeros((1, 31, 31));
+        point[[0, 15, 15]] = 1.0;
+        let point = MaskStack::new(point).unwrap();
+        let blurred = MaskMismatch { blur: 1.5, ..MaskMismatch::default() }.apply(&point).unwrap();
+        let view = blurred.view();
+        assert!((view.sum() - 1.0).abs() < 1e-5);
+        let spread = |axis: usize| {
+            view.indexed_iter().map(|(at, &c)| f64::from(c) * ([at.1, at.2][axis] as f64 - 15.0).powi(2)).sum::<f64>()
+        };
+        assert!((spread(0) - 2.25).abs() < 0.1 && (spread(1) - 2.25).abs() < 0.1, "{} {}", spread(0), spread(1));
+    }
+
+    #[test]
+    fn masks_reach_as_far_as_they_were_told() {
+        assert!(MaskMismatch { shift: [0.05, -0.05], ..MaskMismatch::default() }.reach((5, 6)).iter().all(|r| *r));
+        let found = MaskMismatch { shift: [-1.0, 0.4], ..MaskMismatch::default() }.reach((5, 6));
+        let expected = Array2::from_shape_fn((5, 6), |(i, j)| i < 4 && j > 0);
+        assert_eq!(found, expected);
+        assert!(!MaskMismatch { rotation: 1.0, ..MaskMismatch::default() }.reach((100, 100))[[0, 50]]);
     }
 
     #[test]

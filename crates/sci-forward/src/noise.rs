@@ -45,6 +45,9 @@ pub struct Noise {
 }
 
 impl Noise {
+    /// No noise.
+    pub const NONE: Self = Self { photons: None, sigma: 0.0 };
+
     /// Noise of a sensor that counts `photons` per unit of `y`, in (0, 1e9] (`None`: no shot noise), and whose read noise has
     /// the standard deviation `sigma` ≥ 0 in the unit of `y`.
     ///

@@ -2,6 +2,7 @@
 
 mod clipped;
 mod demosaicked;
+mod dimmed;
 mod flips;
 mod per_lattice;
 mod per_stage;
@@ -10,6 +11,7 @@ mod tiles;
 
 pub use clipped::Clipped;
 pub use demosaicked::Demosaicked;
+pub use dimmed::Dimmed;
 pub use flips::{Flips, flipped_axes};
 pub use per_lattice::PerLattice;
 pub use per_stage::PerStage;

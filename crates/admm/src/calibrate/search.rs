@@ -83,6 +83,7 @@ impl<'s> Search<'s> {
         Ok(Calibrated {
             mismatch: self.best.mismatch,
             black: self.best.black * self.judge.level,
+            exposure: None,
             error: [first, self.best_errors.total()],
             parameters,
             solves: self.solves,

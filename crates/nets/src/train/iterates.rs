@@ -100,6 +100,7 @@ impl IteratesConfig {
             accelerate: true,
             start: (self.start_iterations > 0).then_some((self.start_iterations, START_WEIGHT)),
             flips: true,
+            dim: 1.0,
         }
     }
 }

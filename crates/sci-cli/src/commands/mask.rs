@@ -7,6 +7,7 @@ use ndarray::Axis;
 use sci_forward::{MaskStack, VideoShape};
 
 use super::{Done, array_format, parse_density, parse_size};
+use crate::config::camera::optics_of_arguments;
 use crate::io::output::{Part, write_arrays};
 
 /// Arguments of `sci mask`.
@@ -30,6 +31,10 @@ pub(super) struct Args {
     /// Seed
     #[arg(long, default_value = "0")]
     seed: u64,
+    /// As a camera's optics show them: shift=[DOWN,RIGHT] (pixels), rotation (degrees), scale, blur (pixels), clock (share of the frame
+    /// before), contrast, flicker (of the frames' gains)
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 /// The published ways to make masks.
@@ -54,7 +59,8 @@ impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
         let format = array_format(&self.out)?;
         let shape = VideoShape { frames: self.frames.into(), height: self.size.0, width: self.size.1 };
-        let masks = self.kind.masks(shape, self.density, self.seed)?;
+        let optics = optics_of_arguments(&self.set)?;
+        let masks = optics.masks(&self.kind.masks(shape, self.density, self.seed)?, self.seed)?;
         let data = masks.view().insert_axis(Axis(1));
         write_arrays(&self.out, format, &[Part { name: "mask", data, is_light: false }])?;
         let open = masks.view().iter().filter(|&&c| c > 0.0).count() as f64 / masks.view().len() as f64;

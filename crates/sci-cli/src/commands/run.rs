@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use ndarray::Axis;
-use sci_forward::{Noise, VideoShape};
+use sci_forward::VideoShape;
 use serde_json::json;
 
 use super::{Done, UsageError, catch_interrupts, check_folder, interrupted};
@@ -19,7 +19,7 @@ use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
 use crate::record::host;
 use crate::run_folder::{Finished, RunFolder, RunPlan, Wish, refuse_inputs};
-use crate::simulate::{SeededNoise, simulate};
+use crate::simulate::simulate;
 
 /// Arguments of `sci run`.
 #[derive(Debug, clap::Args)]
@@ -187,9 +187,9 @@ pub(super) fn read_scene(experiment: &Experiment) -> anyhow::Result<Scene> {
     // A single channel of a color sensor is its mosaic.
     let truth = if channels == 3 { Truth::Rgb(video) } else { Truth::Sensor(video.index_axis_move(Axis(1), 0)) };
     let masks = masks(s, &data.reading, (height, width), &mut notes)?;
-    let noise = SeededNoise { noise: Noise::new(s.photons, f64::from(s.sigma))?, seed: s.seed };
     let file = data.path.display().to_string();
-    let mut scene = simulate(&file, &data.reading.keys, masks, truth, data.reading.cfa, noise)?;
+    let mut scene = simulate(&file, &data.reading.keys, masks.clone(), truth, data.reading.cfa, &s.camera)?;
+    scene::as_read(&mut scene, masks, &data.reading)?;
     notes.append(&mut scene.warnings);
     scene.warnings = notes;
     Ok(scene)

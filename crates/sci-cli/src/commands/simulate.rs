@@ -7,9 +7,10 @@ use sci_forward::{CfaPattern, Noise, VideoShape};
 
 use super::mask::Kind;
 use super::{Done, UsageError, array_format, parse_density};
+use crate::config::camera::of_arguments;
 use crate::io::output::{ArrayFormat, Part, write_arrays};
 use crate::io::scene::{self, Keys, Reading, Truth};
-use crate::simulate::{SeededNoise, simulate};
+use crate::simulate::{Camera, simulate};
 
 /// Arguments of `sci simulate`.
 #[derive(Debug, clap::Args)]
@@ -44,9 +45,14 @@ pub(super) struct Args {
     /// Shot noise: photons a pixel counts at full scale of one frame [default: none]
     #[arg(long, value_parser = parse_photons)]
     photons: Option<f64>,
-    /// Seed of masks and noise
+    /// Seed of masks, noise and defects
     #[arg(long, default_value = "0")]
     seed: u64,
+    /// What the camera does, as in [data.camera]. To the masks, which the scene holds as they were before: shift=[DOWN,RIGHT] (pixels),
+    /// rotation (degrees), scale, blur (pixels), clock (share of the frame before), contrast, flicker (of the frames' gains). To the light:
+    /// gain, black, full (the end of the range; both in units of white of a frame), bits, dead and hot (shares of the pixels)
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 /// Bayer patterns on the command line.
@@ -91,6 +97,9 @@ impl Args {
             ))
             .into());
         }
+        let noise = Noise::new(self.photons, f64::from(self.sigma / 255.0))?;
+        let (optics, readout) = of_arguments(&self.set, noise)?;
+        let camera = Camera { optics, readout, seed: self.seed };
         let cfa = self.cfa.map(CfaPattern::from);
         let scene::Video { frames: mut truth, notes } = match cfa {
             None => scene::read_gray_video(&self.video, &Reading::default())?,
@@ -119,10 +128,8 @@ impl Args {
             );
             truth = truth.slice_move(s![..wanted, .., .., ..]);
         }
-        let noise = Noise::new(self.photons, f64::from(self.sigma / 255.0))?;
-        let noise = SeededNoise { noise, seed: self.seed };
         let truth = if cfa.is_some() { Truth::Rgb(truth) } else { Truth::Sensor(truth.index_axis_move(Axis(1), 0)) };
-        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, noise)?;
+        let scene = simulate(&self.video.display().to_string(), &Keys::default(), masks, truth, cfa, &camera)?;
         say(&scene.warnings);
         let mask = scene.operator.adjoint(Array2::ones((height, width)).view());
         let truth = match (&scene.rgb, &scene.truth) {

@@ -5,9 +5,11 @@ use std::path::{Path, PathBuf};
 use sci_forward::{CfaPattern, Noise};
 use serde_json::json;
 
+use super::camera;
 use crate::io::defects::Defects;
 use crate::io::raw::{Packing, Raw};
 use crate::io::scene::{Axes, Clip, Keys, MaskShift, Reading, Sensor};
+use crate::simulate::Camera;
 use crate::table::{ConfigError, Table, as_number};
 
 /// Where the measurements come from.
@@ -41,12 +43,8 @@ pub enum Calibration {
 pub struct Simulate {
     /// The masks.
     pub mask: MaskSource,
-    /// Standard deviation of Gaussian noise, in the unit of y (full scale 1).
-    pub sigma: f32,
-    /// Photons per unit of y, `None` for no shot noise.
-    pub photons: Option<f64>,
-    /// Seed of the noise.
-    pub seed: u64,
+    /// The camera behind them.
+    pub camera: Camera,
 }
 
 /// Where masks come from.
@@ -126,10 +124,7 @@ fn mask_shift(t: &mut Table<'_>, simulated: bool) -> Option<MaskShift> {
         return None;
     }
     let legal = "two numbers from -64 to 64, the pixels down and right from a frame to the next, for example [1, 0]";
-    let step = t.legal("mask_shift", legal, |v| {
-        let both: Option<Vec<f64>> = v.as_array()?.iter().map(as_number).collect();
-        <[f64; 2]>::try_from(both?).ok().filter(|both| both.iter().all(|v| v.abs() <= 64.0))
-    });
+    let step = t.legal("mask_shift", legal, |v| camera::pair(v, 64.0));
     t.show("mask_shift", step.map(|step| json!(step)));
     Some(MaskShift { step: step.unwrap_or_default(), frames: t.required_whole("frames", 2..=1024) })
 }
@@ -150,8 +145,7 @@ fn raw(t: &mut Table<'_>) -> Raw {
 
 /// `[data.sensor]`.
 fn sensor(t: &mut Table<'_>) -> Sensor {
-    let photons = t.optional_number("photons", 1e-3..=1e9);
-    let sigma = t.sigma("noise", 0.0);
+    let noise = noise(t, "noise");
     let legal = "\"auto\", \"none\", or a number above 0 in the unit of the file";
     let clip = t.legal("clip", legal, |v| match (v.as_str(), as_number(v)) {
         (Some("auto"), _) => Some(Clip::Auto),
@@ -161,12 +155,15 @@ fn sensor(t: &mut Table<'_>) -> Sensor {
     });
     let clip = clip.unwrap_or_default();
     t.show("clip", clip.to_json());
-    Sensor {
-        black: t.number("black", 0.0, -1e6..=1e6) as f32,
-        // In range, which is all that can be wrong.
-        noise: Noise::new(photons, f64::from(sigma)).ok().filter(|_| photons.is_some() || sigma > 0.0),
-        clip,
-    }
+    Sensor { black: t.number("black", 0.0, -1e6..=1e6) as f32, noise, clip }
+}
+
+/// Read noise under this key, and shot noise.
+fn noise(t: &mut Table<'_>, key: &str) -> Option<Noise> {
+    let photons = t.optional_number("photons", 1e-3..=1e9);
+    let sigma = t.sigma(key, 0.0);
+    // In range, which is all that can be wrong.
+    Noise::new(photons, f64::from(sigma)).ok().filter(|_| photons.is_some() || sigma > 0.0)
 }
 
 fn calibration(t: &mut Table<'_>) -> Calibration {
@@ -212,14 +209,9 @@ impl Simulate {
             return Err(t.error(problem));
         }
         let mask = t.part("mask", |t| MaskSource::read(t, seed))?;
-        t.part("noise", |t| {
-            Ok(Self {
-                mask,
-                sigma: t.sigma("sigma", 0.0),
-                photons: t.optional_number("photons", 1e-3..=1e9),
-                seed: t.seed("seed", seed),
-            })
-        })
+        let (noise, seed) = t.part("noise", |t| Ok((noise(t, "sigma"), t.seed("seed", seed))))?;
+        let (optics, readout) = t.part("camera", |t| Ok(camera::read(t, noise.unwrap_or(Noise::NONE))))?;
+        Ok(Self { mask, camera: Camera { optics, readout, seed } })
     }
 }
 

@@ -4,6 +4,7 @@
 //! here. What is read is in range, complete and has an effect, so that no other code has to doubt a value; an error names the file and
 //! line (or the `--set` argument), the key, the value and what is legal.
 
+pub mod camera;
 mod data;
 mod online;
 mod output;
@@ -279,6 +280,7 @@ impl Experiment {
             accelerate,
             start,
             flips: part.network().is_some_and(|network| network.flips),
+            dim: part.network().map_or(1.0, |network| network.dim),
         });
         Ok(())
     }
@@ -378,8 +380,7 @@ mod tests {
             "convention": "paper-code", "demosaicer": null,
         });
         assert_eq!((&shown["name"], &shown["solver"]), (&json!("a"), &solver));
-        let denoiser =
-            json!({ "kind": "fastdvdnet", "weights": "b", "precision": "f32", "flips": false, "ends": "circular" });
+        let denoiser = json!({ "kind": "fastdvdnet", "weights": "b", "precision": "f32", "flips": false, "dim": 1.0, "ends": "circular" });
         assert_eq!(shown["denoisers"], json!([denoiser]));
         assert_eq!(shown["stage"], json!([{ "sigma": 0.2f32, "iterations": 3, "denoiser": 0 }]));
         let interval = ::online::AdaptConfig::default().schedule.interval;

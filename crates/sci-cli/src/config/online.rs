@@ -38,11 +38,12 @@ impl Online {
     pub(super) fn read(t: &mut Table<'_>, seed: u64, denoisers: &[Chosen]) -> Option<Self> {
         let enabled = t.flag("enabled", true);
         let split = t.choice("loss", &LOSSES, false);
-        let flips = |d: &Chosen| d.part.network().is_some_and(|network| network.flips);
-        if enabled && !split && denoisers.iter().any(flips) {
+        let otherwise = |d: &Chosen| d.part.network().is_some_and(|network| network.flips || network.dim != 1.0);
+        if enabled && !split && denoisers.iter().any(otherwise) {
             t.complain(
                 "[online] compares what a network gives with the measurement, so that it must see the video the right way \
-                 round; legal: denoiser.flips = false, online.loss = \"split\", or online.enabled = false",
+                 round and as bright as it is; legal: denoiser.flips = false with denoiser.dim = 1, online.loss = \"split\", or \
+                 online.enabled = false",
             );
         }
         let default = SequenceConfig::default();

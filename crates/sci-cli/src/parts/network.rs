@@ -23,6 +23,8 @@ pub struct Inference {
     pub precision: Precision,
     /// Whether it sees the video another way round in every iteration.
     pub flips: bool,
+    /// It sees the video divided by this.
+    pub dim: f32,
 }
 
 /// What networks multiply.
@@ -31,14 +33,14 @@ pub const PRECISIONS: [(&str, Precision); 2] = [("f32", Precision::F32), ("bf16"
 impl Inference {
     /// Of a network that may see the video any way round.
     pub(super) fn read(t: &mut Table<'_>) -> Self {
-        let flips = t.flag("flips", false);
-        Self { flips, ..Self::read_upright(t) }
+        let (flips, dim) = (t.flag("flips", false), t.number("dim", 1.0, 0.1..=100.0) as f32);
+        Self { flips, dim, ..Self::read_upright(t) }
     }
 
     /// Of a network that must see the video as the sensor did.
     pub(super) fn read_upright(t: &mut Table<'_>) -> Self {
         let precision = t.choice("precision", &PRECISIONS, Precision::default());
-        Self { precision, flips: false, weights: t.weights("weights") }
+        Self { precision, flips: false, dim: 1.0, weights: t.weights("weights") }
     }
 
     /// Whether it was trained for the iterates of one schedule.

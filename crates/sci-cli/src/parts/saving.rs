@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use admm::{BoxError, Call, Denoiser, Flips, TileCounter, TileCounts, Tiles};
+use admm::{BoxError, Call, Denoiser, Dimmed, Flips, TileCounter, TileCounts, Tiles};
 use ndarray::{ArrayView4, ArrayViewMut4};
 use nets::kernels::Precision;
 use nets::{MixedPrecision, PrecisionCounter, PrecisionCounts, SelectPrecision};
@@ -74,6 +74,9 @@ impl Saving {
         denoiser = Box::new(Counted { inner: denoiser, multiply_adds, count: self.multiply_adds.clone() });
         if inference.flips {
             denoiser = Box::new(Flips::new(denoiser));
+        }
+        if inference.dim != 1.0 {
+            denoiser = Box::new(Dimmed::new(denoiser, inference.dim));
         }
         self.tiles(denoiser)
     }

@@ -4,6 +4,9 @@ use super::MaskSource;
 use crate::masks::validated;
 use crate::{MaskError, VideoShape};
 use multiversion::multiversion;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 /// The masks of another source, each frame's times a gain of its own: `C_t = g_t S_t`.
 ///
@@ -36,6 +39,28 @@ impl<S: MaskSource> Gained<S> {
             return Err(MaskError::Count { what: "gains", expected: frames, found: gain.len() });
         }
         validated(Self { source, gain })
+    }
+
+    /// A light that flickers: the gains are 1 in the mean, with this standard deviation, and none is negative.
+    ///
+    /// # Errors
+    /// As [`Gained::new`].
+    ///
+    /// ```
+    /// use sci_forward::{Gained, MaskSource, MaskStack, VideoShape};
+    /// let masks = MaskStack::random(VideoShape { frames: 2, height: 4, width: 4 }, 1.0, 0)?;
+    /// let flickering = MaskStack::from_source(&Gained::flickering(masks, 0.1, 5)?)?;
+    /// assert!(flickering.view()[[0, 0, 0]] != flickering.view()[[1, 0, 0]]);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
+    pub fn flickering(source: S, spread: f64, seed: u64) -> Result<Self, MaskError> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut gain = || {
+            let draw: f64 = StandardNormal.sample(&mut rng);
+            (1.0 + spread * draw).max(0.0) as f32
+        };
+        let gains = (0..source.shape().frames).map(|_| gain()).collect();
+        Self::new(source, gains)
     }
 }
 

@@ -25,7 +25,7 @@ mod shift;
 mod source;
 
 pub use error::SceneError;
-pub use read::{Video, read, read_gray_video, read_mask, read_video};
+pub use read::{Video, as_read, read, read_gray_video, read_mask, read_video};
 pub use sensor::{Clip, Sensor};
 pub use shift::MaskShift;
 
@@ -174,10 +174,7 @@ impl Scene {
             }
         };
         let brightest = masks.sum().iter().copied().fold(0.0, f32::max);
-        let operator: Arc<dyn SensingOperator> = match BinaryMasks::new(&masks) {
-            Ok(binary) => Arc::new(MaskOperator::new(binary)),
-            Err(_) => Arc::new(MaskOperator::new(masks)),
-        };
+        let operator = operator_of(masks);
         let mut warnings = Vec::new();
         let measurements = match (measurements, &truth) {
             (Some(m), _) => m,
@@ -271,6 +268,14 @@ impl Scene {
                 100.0 * mismatch
             ));
         }
+    }
+}
+
+/// H of masks; binary ones take a bit a pixel.
+pub fn operator_of(masks: MaskStack) -> Arc<dyn SensingOperator> {
+    match BinaryMasks::new(&masks) {
+        Ok(binary) => Arc::new(MaskOperator::new(binary)),
+        Err(_) => Arc::new(MaskOperator::new(masks)),
     }
 }
 

@@ -9,7 +9,9 @@ use sci_forward::bayer::mosaic_into;
 use super::layout::Place;
 use super::scale::{self, Content};
 use super::source::Source;
-use super::{Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Truth, brightest_hundredth, names};
+use super::{
+    Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, Truth, brightest_hundredth, names, operator_of,
+};
 use crate::io::samples::Array;
 use crate::io::{NamedArrays, defects};
 
@@ -105,6 +107,27 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     Ok(scene)
 }
 
+/// Treats a simulated scene, whose masks are told to be `masks`, as one that was read: its sensor and its defects.
+///
+/// # Errors
+/// If no pixel is left that is not defective.
+pub fn as_read(scene: &mut Scene, masks: MaskStack, reading: &Reading) -> Result<(), SceneError> {
+    let Sensor { black, noise, clip } = reading.sensor;
+    let (level, note) = clip.level(scene.measurements.view(), masks.sum().view());
+    scene.warnings.extend(note);
+    scene.measurements -= black;
+    (scene.noise, scene.clip) = (noise, level.map(|level| level - black));
+    let mut mask = masks.view().to_owned();
+    look_for_defects(&mut mask, &mut scene.measurements, reading, scene.cfa.is_some(), &mut scene.warnings);
+    if reading.defects == Defects::Exclude {
+        let key = reading.keys.mask.clone();
+        let masks =
+            MaskStack::new(mask).map_err(|source| SceneError::Mask { file: "simulated".into(), key, source })?;
+        scene.operator = operator_of(masks);
+    }
+    Ok(())
+}
+
 /// The masks `[B, H, W]`, from their own file if they have one, and whether they were in a unit of their own.
 fn scene_masks(
     source: &Source,
@@ -121,7 +144,7 @@ fn scene_masks(
         return Err(source.missing(key, "the masks; data.mask names a file of their own", names));
     };
     let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
-    Ok(normalised(place.frames(&array, 1.0)?))
+    Ok(normalised(place.frames(&array, 1.0)?, key, notes))
 }
 
 /// The masks that a file holds, under their name if it has names.
@@ -152,7 +175,7 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
         }
         false => 1.0,
     };
-    let (masks, in_own_unit) = normalised(place.frames(&array, white)?);
+    let (masks, in_own_unit) = normalised(place.frames(&array, white)?, &key, notes);
     let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
         file: source.file.clone(),
         key: key.clone(),
@@ -162,9 +185,16 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
 }
 
 /// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
-/// which the most open pixel is taken to be open.
-fn normalised(mut mask: Array3<f32>) -> (Array3<f32>, bool) {
+/// which the most open pixel is taken to be open. Small negative ones are what a dark frame leaves when it is taken off.
+fn normalised(mut mask: Array3<f32>, key: &str, notes: &mut Vec<String>) -> (Array3<f32>, bool) {
     let most = mask.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
+    let least = mask.iter().copied().fold(0.0, f32::min);
+    if least < 0.0 && least >= -SMALL * most {
+        let count = mask.iter().filter(|c| **c < 0.0).count();
+        notes.push(format!("`{key}`: {count} transmittances below 0, down to {least}, count as 0"));
+        // Not `max`: a NaN is to be refused.
+        mask.mapv_inplace(|c| if c < 0.0 { 0.0 } else { c });
+    }
     if most <= MOST_TRANSMITTANCE {
         return (mask, false);
     }
@@ -174,6 +204,8 @@ fn normalised(mut mask: Array3<f32>) -> (Array3<f32>, bool) {
     (mask, !is_black_and_white)
 }
 
+/// Negative transmittances are noise down to this share of the largest.
+const SMALL: f32 = 0.1;
 /// Gains of single frames may take a transmittance above 1.
 const MOST_TRANSMITTANCE: f32 = 2.0;
 

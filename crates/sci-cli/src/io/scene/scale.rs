@@ -15,8 +15,10 @@ pub(super) const FULL_SCALES: [(u32, f32); 5] = [(8, 255.0), (10, 1023.0), (12, 
 const OVERSHOOT: f32 = 2.0;
 /// Where the brightest hundredth of measurements lies, in units of a white that is to be believed.
 const BELIEVABLE: std::ops::RangeInclusive<f32> = 0.3..=1.3;
-/// How far the ratio of measurements to masked sums may be from a full scale that it stands for.
+/// How far the ratio of measurements to masked sums may be from the usual full scale, to stand for it.
 const NEAR: f32 = 0.1;
+/// The same of scales that are not usual.
+const HIT: f32 = 0.005;
 
 /// What white is stored as.
 #[derive(Clone, Debug, PartialEq)]
@@ -139,7 +141,7 @@ pub(super) fn of_measurements(
         return White::plain(white);
     }
     let usual = content.usual;
-    if let Some(white) = truth.and_then(|x| told_by_truth(meas, masks, x)) {
+    if let Some(white) = truth.and_then(|x| told_by_truth(meas, masks, x, usual)) {
         return if white == usual {
             White::plain(white)
         } else {
@@ -184,8 +186,13 @@ fn of_deep_measurements(key: &str, content: &Content, bright: f32) -> White {
     }
 }
 
-/// The full scale on which the first measurement is the masked sum of the truth.
-fn told_by_truth(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Option<f32> {
+/// The scale on which the first measurement is the masked sum of the truth.
+fn told_by_truth(
+    meas: ArrayView3<'_, f32>,
+    masks: ArrayView3<'_, f32>,
+    truth: ArrayView3<'_, f32>,
+    usual: f32,
+) -> Option<f32> {
     let frames = masks.len_of(Axis(0));
     let fits = meas.dim().0 > 0 && truth.dim().0 >= frames && meas.shape()[1..] == truth.shape()[1..];
     if !fits || masks.shape()[1..] != truth.shape()[1..] {
@@ -203,8 +210,11 @@ fn told_by_truth(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>, truth: A
     let ratio = both / square;
     // The part of y that no multiple of the masked sum explains.
     let unexplained = 1.0 - both * both / (square * measured);
-    let near = |full: &f32| (ratio as f32 / full - 1.0).abs() < NEAR;
-    (unexplained < 0.05).then(|| [1.0].into_iter().chain(FULL_SCALES.map(|s| s.1)).find(near)).flatten()
+    let near = |full: f32, most: f32| (ratio as f32 / full - 1.0).abs() < most;
+    // What a camera adds to the usual scale is its own; else a full scale must be hit, or the unit is one of its own.
+    let known = || [1.0].into_iter().chain(FULL_SCALES.map(|s| s.1)).find(|&full| near(full, HIT));
+    let scale = || if near(usual, NEAR) { usual } else { known().unwrap_or(ratio as f32) };
+    (unexplained < 0.05 && ratio > 0.0).then(scale)
 }
 
 #[cfg(test)]
@@ -274,7 +284,9 @@ mod tests {
             let found = of_measurements("meas", &content, stored.view(), masks.view(), Some(truth.view()));
             assert_eq!((found.value, found.note.is_some()), (full, true));
         }
-        assert_eq!(told_by_truth(y.view(), masks.view(), (truth * 0.5).view()), None);
+        let other = told_by_truth(y.view(), masks.view(), (&truth * 0.5).view(), 1.0).unwrap();
+        assert!((other - 2.0).abs() < 1e-4, "{other}");
+        assert_eq!(told_by_truth(y.view(), masks.view(), (truth - 0.5).view(), 1.0), None);
     }
 
     #[test]
