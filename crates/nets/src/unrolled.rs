@@ -24,7 +24,7 @@ pub struct Recipe {
     pub sigmas: Vec<f32>,
     /// Whether y1 accumulates what the iterates miss ([`Gap::accelerated`]), or is y.
     pub accelerate: bool,
-    /// Iterations of TV, of this weight, that it starts from; none start from the normalised measurement.
+    /// Iterations of TV, of this weight above 0, that it starts from; nothing starts from the normalised measurement.
     pub start: Option<(usize, f32)>,
     /// Whether the network sees the video another way round in every call ([`Flips`]).
     pub flips: bool,
@@ -130,11 +130,12 @@ impl Recipe {
         let stages: Vec<Stage> =
             self.sigmas[..count].iter().map(|&s| Stage { sigma: Some(s), iterations: 1 }).collect();
         let cfa = measurement.cfa();
-        let (iterations, weight) = self.start.unwrap_or((0, 0.0));
-        let mut tv = Tv::new(weight).on_sensor(cfa);
-        let start = match iterations {
-            0 => Start::Mean,
-            _ => Start::Warm { prior: &mut *tv, stage: Stage { sigma: None, iterations } },
+        let mut tv = self.start.map(|(iterations, weight)| (iterations, Tv::new(weight).on_sensor(cfa)));
+        let start = match &mut tv {
+            Some((iterations, prior)) => {
+                Start::Warm { prior: &mut **prior, stage: Stage { sigma: None, iterations: *iterations } }
+            }
+            None => Start::Mean,
         };
         let prior: Box<dyn Prior + '_> = match cfa {
             None => Box::new(denoiser),

@@ -47,7 +47,7 @@ pub struct SplitConfig {
     pub hidden: f64,
     /// The last calls of a solve, at least 1, which the gradient goes through.
     pub calls: usize,
-    /// Of Adam.
+    /// Of Adam, after a rise over the first ten updates.
     pub learning_rate: f64,
     /// Decay of the moving average of the weights in an update, in [0, 1).
     pub average: f64,
@@ -70,8 +70,8 @@ pub struct SplitConfig {
 impl Default for SplitConfig {
     fn default() -> Self {
         Self {
-            updates: 50,
-            crops: 2,
+            updates: 60,
+            crops: 1,
             side: 64,
             hidden: 0.12,
             calls: 3,
@@ -79,7 +79,7 @@ impl Default for SplitConfig {
             average: 0.95,
             judging: 0.05,
             judged_crops: 8,
-            every: 10,
+            every: 20,
             patience: 2,
             parameters: Parameters::All,
             precision: Precision::Bf16,
@@ -319,7 +319,9 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
             return Ok(None);
         }
         let Gradients { loss, of_vars } = Gradients::mean(lessons);
-        if !loss.is_finite() || !self.adam.apply(&of_vars, config.learning_rate, CLIP_NORM)?.is_finite() {
+        // Adam's first steps are as long as any, but know the direction least.
+        let rate = config.learning_rate * (number as f64 / WARM_UP).min(1.0);
+        if !loss.is_finite() || !self.adam.apply(&of_vars, rate, CLIP_NORM)?.is_finite() {
             return Ok(None);
         }
         // Shorter at first, so that it follows at all in few updates.
@@ -369,6 +371,8 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     }
 }
 
+/// Updates over which the learning rate rises.
+const WARM_UP: f64 = 10.0;
 /// Longest gradient; longer ones are shortened to it.
 const CLIP_NORM: f64 = 1.0;
 
