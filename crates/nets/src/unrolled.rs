@@ -91,6 +91,9 @@ impl Gradients {
     }
 }
 
+/// Maps a result `[T, C, H, W]` to its loss, and the gradient by that result.
+pub type LossOfResult<'l> = dyn Fn(ArrayView4<'_, f32>) -> Result<(f32, Array4<f32>)> + 'l;
+
 impl Recipe {
     /// The result `[T, C, H, W]` of all calls.
     ///
@@ -158,9 +161,8 @@ impl Recipe {
     }
 
     /// The weighted mean loss of the results of consecutive calls, each of half the weight of the one after it, as the last is what a
-    /// user gets, and its gradient for each of `vars`, through the network and the data steps between. `loss` maps a result
-    /// `[T, C, H, W]` to its loss and the gradient by that result. Goes backward call by call, each run again with its graph, so
-    /// that the memory is that of one.
+    /// user gets, and its gradient for each of `vars`, through the network and the data steps between. Goes backward call by call, each
+    /// run again with its graph, so that the memory is that of one.
     ///
     /// # Errors
     /// When a tensor operation fails.
@@ -170,7 +172,7 @@ impl Recipe {
         calls: &[RecordedCall],
         network: &dyn Network,
         vars: &[(String, Var)],
-        loss: &dyn Fn(ArrayView4<'_, f32>) -> Result<(f32, Array4<f32>)>,
+        loss: &LossOfResult<'_>,
     ) -> Result<Gradients> {
         let mut share = 0.5 / (1.0 - 0.5f32.powi(calls.len() as i32));
         let mut total = Gradients::zero(vars.len());

@@ -1,7 +1,8 @@
 //! The network against its own graph, its definition, and finite differences.
 
 use super::*;
-use candle_core::DType;
+use candle_core::{DType, Device};
+use ndarray::{Array3, Zip};
 use rand::RngExt;
 
 const SPEC: UnfoldingSpec = UnfoldingSpec { channels: 1, iterations: 2, widths: [16, 32, 16], depth: 1 };
