@@ -42,7 +42,7 @@ impl FastdvdnetSpec {
         (per_frame != 3).then_some(Self { channels, widths, batch_norm })
     }
 
-    fn block(self) -> Result<BlockSpec> {
+    pub(crate) fn block(self) -> Result<BlockSpec> {
         let Self { channels, widths, batch_norm } = self;
         if channels != 1 && channels != 3 {
             let legal = "1 (gray) or 3 (RGB)".into();

@@ -79,7 +79,7 @@ impl FfdnetSpec {
         Some(Self { channels, width, depth: last.div_ceil(step) + 1, layout })
     }
 
-    fn validate(self) -> Result<Self> {
+    pub(crate) fn validate(self) -> Result<Self> {
         let bad =
             |key, value: usize, legal: &str| Err(Error::Setting { key, value: value.to_string(), legal: legal.into() });
         match self {

@@ -262,8 +262,8 @@ impl Source<'_> {
                     Some(tensor) => report.mismatched.push((name, shape.to_vec(), tensor.dims().to_vec())),
                     None => report.missing.push(name),
                 }
-                // A placeholder: `finish` will refuse the whole.
-                Ok(Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu)?)
+                // A placeholder, one number long: `finish` will refuse the whole.
+                Ok(Tensor::new(0f32, &Device::Cpu)?.broadcast_as(shape)?)
             }
         }
     }

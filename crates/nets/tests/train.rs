@@ -254,16 +254,21 @@ fn noise_or_iterates_but_not_both() {
 
 #[test]
 fn the_number_of_threads_changes_no_bit() {
-    let config = config(FFDNET, 1, 3);
-    let with = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let mut trainer = trainer(&config);
-            run(&mut trainer, 3);
-            bits(&trainer)
-        })
-    };
-    assert_eq!(with(1), with(3));
+    // Wide enough for Muon's steps, and with several lessons a step, whose gradients are summed.
+    let wide = config(NetworkConfig::Ffdnet { channels: 1, width: 16, depth: 4 }, 1, 3);
+    let mut lessons = on_iterates(wide.clone());
+    lessons.data.batch = 2;
+    for config in [wide, lessons] {
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let mut trainer = trainer(&config);
+                run(&mut trainer, 3);
+                bits(&trainer)
+            })
+        };
+        assert_eq!(with(1), with(3));
+    }
 }
 
 #[test]
@@ -298,20 +303,82 @@ fn a_damaged_checkpoint_is_refused_and_the_one_before_it_used() {
 fn a_checkpoint_of_other_settings_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.safetensors");
-    let config = config(FFDNET, 1, 9);
+    let config = on_iterates(config(FFDNET, 1, 9));
     trainer(&config).save(&path).unwrap();
-    let other = TrainConfig {
-        weights: None,
-        renew: vec![],
-        noise: Some(NoiseConfig { sigma: [5.0, 10.0] }),
-        iterates: None,
-        ..config.clone()
-    };
-    let error = trainer(&other).resume(&path).unwrap_err().to_string();
-    assert!(error.contains("noise") && error.contains("50.0"), "{error}");
+    type Change = fn(&mut TrainConfig);
+    let changes: [(Change, &str); 7] = [
+        (|c| c.name = "other".into(), "name = \"test\", not \"other\""),
+        (|c| c.seed = 4, "seed = 3, not 4"),
+        (|c| c.weights = Some("bundled:ffdnet_gray".into()), "weights = null, not \"bundled:ffdnet_gray\""),
+        (|c| c.network = NetworkConfig::Ffdnet { channels: 1, width: 9, depth: 3 }, "network.width = 8, not 9"),
+        (|c| c.data.patch = 12, "data.patch = 16, not 12"),
+        (|c| c.iterates.as_mut().unwrap().holes = 0.2, "iterates.holes = 0.1, not 0.2"),
+        (|c| c.training.steps = 10, "training.steps = 9, not 10"),
+    ];
+    for (change, needle) in changes {
+        let mut other = config.clone();
+        change(&mut other);
+        let error = trainer(&other).resume(&path).unwrap_err().to_string();
+        assert!(error.contains("run.safetensors") && error.contains(needle), "{error}");
+    }
     let mut moved = config;
     moved.data.photos = Some("elsewhere".into());
+    moved.validation.every = 7;
+    moved.checkpoint.every = 7;
     trainer(&moved).resume(&path).unwrap();
+}
+
+#[test]
+fn a_checkpoint_knows_whether_the_run_began_with_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let config = config(FFDNET, 1, 2);
+    let weights = trainer(&TrainConfig { seed: 8, ..config.clone() }).weights().unwrap();
+    let mut straight = trainer(&config);
+    straight.start_from(&weights).unwrap();
+    straight.save(&path).unwrap();
+    run(&mut straight, 2);
+    let mut second = trainer(&config);
+    second.resume(&path).unwrap();
+    run(&mut second, 2);
+    assert_eq!(bits(&second), bits(&straight));
+}
+
+#[test]
+fn a_divergence_is_gone_back_on_at_half_the_rate() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let config = config(FFDNET, 1, 20);
+    let mut diverging = trainer(&config);
+    let lose = |trainer: &mut Trainer| {
+        let huge = trainer.weights().unwrap().into_iter().map(|(name, t)| (name, t.affine(0.0, 1e20).unwrap()));
+        trainer.start_from(&huge.collect()).unwrap();
+        assert!(matches!(trainer.step(), Err(Error::Diverged { .. })));
+    };
+    // From the only checkpoint there is.
+    diverging.save(&path).unwrap();
+    run(&mut diverging, 1);
+    lose(&mut diverging);
+    diverging.back_off(&path).unwrap();
+    assert_eq!((diverging.steps_done(), diverging.rate()), (0, 0.5));
+    // From the one before the last, whatever it says of the rate.
+    run(&mut diverging, 2);
+    diverging.save(&path).unwrap();
+    let good = bits(&diverging);
+    run(&mut diverging, 1);
+    diverging.save(&path).unwrap();
+    for rate in [0.25, 0.125] {
+        lose(&mut diverging);
+        diverging.back_off(&path).unwrap();
+        assert_eq!((diverging.steps_done(), diverging.rate(), bits(&diverging)), (2, rate, good.clone()));
+    }
+    // The lower rate is a part of what is saved.
+    let mut resumed = trainer(&config);
+    resumed.resume(&path).unwrap();
+    let reports = [run(&mut diverging, 1)[0], run(&mut resumed, 1)[0]];
+    assert_eq!(reports[0], reports[1]);
+    assert_eq!(reports[0].learning_rate, config.learning_rate(2) / 8.0);
+    assert_eq!(bits(&resumed), bits(&diverging));
 }
 
 /// Training on one still image: less than half of the noise is left.

@@ -17,3 +17,4 @@ pub mod run_folder;
 pub mod simulate;
 pub mod solvers;
 pub mod table;
+pub mod training;

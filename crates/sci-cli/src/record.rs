@@ -246,8 +246,16 @@ impl Record {
     /// # Errors
     /// [`FileError`] if it cannot be read, is not such a record, or has another [`SCHEMA`].
     pub fn read(path: &Path) -> Result<Self, FileError> {
+        Self::parse(path, &read_file(path)?)
+    }
+
+    /// Reads the bytes of a `record.json`; `path` is for messages.
+    ///
+    /// # Errors
+    /// [`FileError`] if it is not such a record, or has another [`SCHEMA`].
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, FileError> {
         let malformed = |reason| FileError::new(path, ReadError::Malformed { format: "record.json", reason });
-        let record: Self = serde_json::from_slice(&read_file(path)?).map_err(|e| malformed(e.to_string()))?;
+        let record: Self = serde_json::from_slice(bytes).map_err(|e| malformed(e.to_string()))?;
         if record.schema != SCHEMA {
             return Err(malformed(format!("schema {}, this version reads {SCHEMA}", record.schema)));
         }
@@ -300,14 +308,7 @@ pub(crate) mod tests {
     use super::*;
 
     /// The example of the format's description, with every name a reader may rely on.
-    pub(crate) const EXAMPLE: &str = r#"
-{ "schema": 1, "experiment": "gray/gap-tv", "scene": "traffic48.mat", "solver": "gap", "denoiser": "tv",
-  "measurements": [ { "index": 0, "psnr_db": 20.76, "ssim": 0.687, "ssim_gaussian": 0.70, "psnr_rgb_db": null, "seconds": 0.05, "iterations": 40,
-      "stop": "schedule_done", "relative_residual": 0.001, "updates": 0, "denoiser_calls": 40, "gmac": null, "skipped": { "iterations": 0, "tiles": 0.0, "updates": 0 },
-      "trace": { "psnr_db": [], "relative_residual": [], "relative_change": [], "seconds": [] } } ],
-  "mean": { "psnr_db": 20.76, "ssim": 0.687, "seconds": 0.05, "iterations": 40.0 },
-  "peak_rss_bytes": 0, "threads": 2, "seed": 0, "version": "", "revision": "", "cpu": "",
-  "kernel": "avx2", "precision_used": "f32", "wall_seconds": 0.5, "files": ["recon.npy"], "config": { } }"#;
+    pub(crate) const EXAMPLE: &str = include_str!("../../../tests/fixtures/record.json");
 
     #[test]
     fn names_are_those_of_the_format() {

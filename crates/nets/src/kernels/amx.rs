@@ -5,12 +5,11 @@
 //! cache line of `hi` and one of `lo`, so that 16 neighbouring pixels are a tile where they lie. Without `lo`
 //! ([`Form::Half`]) it has half the size, and a product is one.
 
-use super::blocked::{Form, Pixel, View, ViewMut, ZERO};
-use super::conv::Store;
+use super::blocked::{Form, Pixel, Store, View, ViewMut, ZERO};
+use super::geometry::{Panel, Step, Strip, Weights};
 use super::scratch::Slot;
 use super::simd::LANES;
 use super::tile::Run;
-use super::{Panel, Step, Strip, Weights};
 use std::arch::asm;
 use std::arch::x86_64::*;
 
@@ -19,32 +18,6 @@ pub(super) const PAIR: usize = 2 * LANES;
 
 /// Cache lines of a tile.
 const ROWS: usize = 16;
-
-/// Whether processor and system have the unit; asks the system for its use, once.
-pub(super) fn available() -> bool {
-    static ANSWER: std::sync::OnceLock<bool> = std::sync::OnceLock::new();
-    *ANSWER.get_or_init(|| {
-        const BF16_AND_TILES: u32 = 1 << 22 | 1 << 24;
-        is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512bw")
-            && is_x86_feature_detected!("avx512bf16")
-            && __cpuid_count(7, 0).edx & BF16_AND_TILES == BF16_AND_TILES
-            && permitted()
-    })
-}
-
-/// Linux saves the tiles of a process only if it asks.
-fn permitted() -> bool {
-    #[cfg(target_os = "linux")]
-    {
-        const ARCH_REQ_XCOMP_PERM: libc::c_long = 0x1023;
-        const TILE_DATA: libc::c_long = 18;
-        // SAFETY: the call reads no memory.
-        unsafe { libc::syscall(libc::SYS_arch_prctl, ARCH_REQ_XCOMP_PERM, TILE_DATA) == 0 }
-    }
-    #[cfg(not(target_os = "linux"))]
-    false
-}
 
 /// A convolution's filters, split, in the order in which they are read.
 #[derive(Debug)]
@@ -130,7 +103,7 @@ type Results = [Pixel; 2 * PAIR];
 /// Convolves a strip of a split or halved image.
 ///
 /// # Safety
-/// [`available`]; the strip's memory is valid, and that of its input 96 pixels beyond its last row.
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available; the strip's memory is valid, and that of its input 96 pixels beyond its last row.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn forward(conv: &Amx, bias: &[Pixel], floor: f32, strip: Strip, store: Store, slot: &mut Slot) {
     let Strip { src, dst, rows, width } = strip;
@@ -407,7 +380,7 @@ pub(super) fn rounded(a: __m512, b: __m512) -> __m512i {
 /// the lanes beyond the last channel hold, zeros stand for it: the matrix unit multiplies them too.
 ///
 /// # Safety
-/// [`available`]; `src` has the pixels, `dst` room for them, rounded up to an even number of blocks.
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available; `src` has the pixels, `dst` room for them, rounded up to an even number of blocks.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn convert(src: View, channels: usize, count: usize, dst: ViewMut, form: Form) {
     let (src_block, dst_block) = (src.block, dst.block);

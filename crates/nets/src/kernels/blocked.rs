@@ -1,7 +1,8 @@
 //! The layout that the kernels work in: channels in blocks of 16, a border of zeros around every plane.
 
-use super::KernelError;
-use super::simd::{Isa, LANES, Simd, entry};
+use super::error::KernelError;
+use super::isa::Isa;
+use super::simd::{LANES, Simd, entry};
 use rayon::prelude::*;
 
 /// One block of channels at one pixel: a cache line.
@@ -21,6 +22,16 @@ pub(crate) enum Form {
     Split,
     /// One bf16 number each, 32 channels a block: what training in bf16 keeps.
     Half,
+}
+
+/// What becomes of a result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Store {
+    /// It is written.
+    As(Form),
+    /// Its channels are four phases of an image of twice the size, in whole pairs of blocks each. They are added to the
+    /// image of this form that is there.
+    AddShuffled(Form),
 }
 
 /// Pixels after the last one: tiles of the matrix unit end where a row does only if it has whole ones.

@@ -2,10 +2,13 @@
 
 #[cfg(target_arch = "x86_64")]
 use super::amx;
-use super::blocked::{Blocked, Form, Pixel, SLACK, View, ViewMut, ZERO, padded};
+use super::blocked::{Blocked, Form, Pixel, SLACK, Store, View, ViewMut, ZERO, check_len, padded};
+use super::error::KernelError;
+use super::geometry::{Conv3x3, Precision, Step, Strip, Weights};
+use super::isa::Isa;
 use super::scratch::{Scratch, Slot};
-use super::simd::{Isa, LANES};
-use super::{KernelError, Precision, Step, Strip, Weights, direct, winograd};
+use super::simd::LANES;
+use super::{direct, winograd};
 
 #[derive(Debug)]
 enum Filters {
@@ -31,7 +34,7 @@ pub struct PackedConv {
     form: Form,
 }
 
-/// Whether Winograd's way is the faster; see the module header for the measurements behind the constants.
+/// Whether Winograd's way is the faster; see `docs/kernels.md` for the measurements behind the constants.
 pub(super) fn prefers_winograd(inputs: usize, outputs: usize, groups: usize, step: Step) -> bool {
     if step != Step::Same || groups != 1 {
         return false;
@@ -53,7 +56,7 @@ impl PackedConv {
         bias: Option<&[f32]>,
         inputs: usize,
         outputs: usize,
-        opts: super::Conv3x3,
+        opts: Conv3x3,
     ) -> Result<Self, KernelError> {
         Self::new_on(Isa::detect()?, weights, bias, inputs, outputs, opts)
     }
@@ -68,13 +71,13 @@ impl PackedConv {
         bias: Option<&[f32]>,
         inputs: usize,
         outputs: usize,
-        opts: super::Conv3x3,
+        opts: Conv3x3,
     ) -> Result<Self, KernelError> {
         let step = Step::of_stride(opts.stride)?;
         let weights = Weights::new(weights, inputs, outputs, opts.groups)?;
         let mut conv = Self::pack(isa.checked()?, &weights, step, opts.precision);
         if let Some(bias) = bias {
-            super::blocked::check_len(outputs, bias.len())?;
+            check_len(outputs, bias.len())?;
             for (o, &b) in bias.iter().enumerate() {
                 conv.bias[o / LANES].0[o % LANES] = b;
             }
@@ -275,16 +278,6 @@ impl PackedConv {
             }
         }
     }
-}
-
-/// What becomes of a result.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Store {
-    /// It is written.
-    As(Form),
-    /// Its channels are four phases of an image of twice the size, in whole pairs of blocks each. They are added to the
-    /// image of this form that is there.
-    AddShuffled(Form),
 }
 
 /// Whether the matrix unit is the faster; of up to 16 channels it would waste half and more.

@@ -1,10 +1,10 @@
 //! Convolution by its definition over channel blocks: for strides, groups, few channels and tiny images.
 
 use super::blocked::{Pixel, ZERO};
+use super::geometry::{ChannelRun, GradStrip, Panel, Step, Strip, Weights};
 use super::scratch::Slot;
 use super::simd::{LANES, Simd, entry};
 use super::tile::{Out, Run, outer, product};
-use super::{ChannelRun, GradStrip, Panel, Step, Strip, Weights};
 
 /// Input channels, one row and column of the filter away.
 #[derive(Debug, Clone, Copy)]

@@ -5,11 +5,14 @@
 
 use super::blocked::{Blocked, Form, Pixel, ZERO};
 use super::conv::{prefers_winograd, strip_rows};
+use super::error::KernelError;
+use super::geometry::{GradStrip, Step, Weights};
 #[cfg(target_arch = "x86_64")]
 use super::half;
+use super::isa::Isa;
 use super::scratch::Scratch;
-use super::simd::{Isa, LANES};
-use super::{GradStrip, KernelError, Step, Weights, direct, winograd};
+use super::simd::LANES;
+use super::{direct, winograd};
 use rayon::prelude::*;
 use std::sync::Mutex;
 

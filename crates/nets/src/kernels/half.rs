@@ -11,9 +11,9 @@
 
 use super::amx::{TILES, rounded, widen};
 use super::blocked::{Blocked, Form, Pixel, ZERO};
+use super::geometry::{GradStrip, Weights};
 use super::scratch::Slot;
 use super::simd::LANES;
-use super::{GradStrip, Weights};
 use std::arch::asm;
 use std::arch::x86_64::*;
 
@@ -29,7 +29,7 @@ const SUMS: usize = HALVES * HALVES / LANES;
 /// `half = bf16(single)`, border and all.
 ///
 /// # Safety
-/// [`amx::available`](super::amx::available).
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available.
 ///
 /// # Panics
 /// When the shapes or forms are not those of the two.
@@ -58,7 +58,7 @@ pub(super) unsafe fn round(single: &Blocked, half: &mut Blocked) {
 /// Lets a gradient through where the ReLU let its value `y` through.
 ///
 /// # Safety
-/// [`amx::available`](super::amx::available).
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available.
 #[target_feature(enable = "avx512f,avx512bw")]
 pub(super) unsafe fn mask(grad: &mut Blocked, y: &Blocked) {
     for (g, y) in grad.pixels_mut().iter_mut().zip(y.pixels()) {
@@ -74,7 +74,7 @@ pub(super) unsafe fn mask(grad: &mut Blocked, y: &Blocked) {
 /// `sum += other`, of one shape.
 ///
 /// # Safety
-/// [`amx::available`](super::amx::available).
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn add(sum: &mut Blocked, other: &Blocked) {
     for (sum, other) in sum.pixels_mut().iter_mut().zip(other.pixels()) {
@@ -165,7 +165,7 @@ impl Products {
 /// pictures is most of the work.
 ///
 /// # Safety
-/// [`amx::available`](super::amx::available); both images have the strips, and that of the input 34 pixels beyond its last row.
+/// [`Isa::Amx`](super::isa::Isa::Amx) is available; both images have the strips, and that of the input 34 pixels beyond its last row.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(super) unsafe fn weight_grad(
     plan: &GradPlan,

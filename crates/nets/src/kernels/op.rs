@@ -5,11 +5,13 @@
 
 use super::blocked::{Blocked, Form};
 use super::conv::PackedConv;
+use super::error::KernelError;
+use super::geometry::{Conv3x3, Precision, Step, Weights};
 use super::grad::{bias_grad, weight_grad};
 use super::half;
+use super::isa::Isa;
 use super::scratch::{IMAGES, Scratch};
-use super::simd::Isa;
-use super::{KernelError, Step, Weights, shuffle};
+use super::shuffle;
 use candle_core::{CpuStorage, CustomOp2, DType, Device, Error, Layout, Result, Shape, Storage, Tensor};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -17,37 +19,6 @@ use std::sync::{Mutex, PoisonError};
 
 /// Of what knows nothing of candle.
 type Checked<T> = std::result::Result<T, KernelError>;
-
-/// How a 3×3 convolution is done; the padding is always one zero on each side.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Conv3x3 {
-    /// Step between output pixels: 1 or 2.
-    pub stride: usize,
-    /// Number of channel groups; it divides both channel counts.
-    pub groups: usize,
-    /// Apply `max(·, 0)` to the result.
-    pub relu: bool,
-    /// What numbers are multiplied.
-    pub precision: Precision,
-}
-
-impl Default for Conv3x3 {
-    /// Stride 1, one group, no ReLU, f32.
-    fn default() -> Self {
-        Self { stride: 1, groups: 1, relu: false, precision: Precision::F32 }
-    }
-}
-
-/// What numbers are multiplied, and kept between the layers of a [`conv_chain`]; sums and parameters are f32 in any case.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// f32.
-    #[default]
-    F32,
-    /// bf16, 8 bits: twice as fast to train with, and where the processor has no matrix unit for it, f32.
-    Bf16,
-}
 
 /// A layer of a [`conv_chain`].
 #[derive(Debug, Clone)]

@@ -1,8 +1,9 @@
 //! What the register tile reaches when nothing waits for memory: the yardstick of the benchmarks.
 
-use super::KernelError;
 use super::blocked::{Pixel, ZERO};
-use super::simd::{Isa, LANES, Simd, entry};
+use super::error::KernelError;
+use super::isa::Isa;
+use super::simd::{LANES, Simd, entry};
 use super::tile::{Out, Run, product};
 use rayon::prelude::*;
 use std::time::Instant;

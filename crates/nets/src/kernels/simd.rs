@@ -1,109 +1,11 @@
-//! Sixteen f32 lanes on each instruction set, and the choice between them.
+//! Sixteen f32 lanes on each instruction set.
 //!
 //! Every kernel is written once over [`Simd`]. The bodies are `#[inline(always)]`, so that they take on the target
 //! features of the entry point that [`entry!`](super::entry) makes for each instruction set. Closures and iterator
 //! adaptors are avoided in them: those would be compiled without the features.
 
-use super::KernelError;
-use std::sync::OnceLock;
-
 /// Lanes in a vector, and channels in a block of the blocked layout.
 pub const LANES: usize = 16;
-
-/// An instruction set that the kernels are compiled for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Isa {
-    /// x86-64 with AMX for bf16: AVX-512F, but products of more than 16 input channels on the matrix unit, to 17 bits.
-    Amx,
-    /// x86-64 with AVX-512F: a vector is one register.
-    Avx512,
-    /// x86-64 with AVX2 and FMA: a vector is two registers.
-    Avx2,
-    /// AArch64: a vector is four registers.
-    Neon,
-    /// Plain Rust, for any machine; without fused multiply-add.
-    Portable,
-}
-
-impl Isa {
-    /// All of them, the fastest first.
-    pub const ALL: [Self; 5] = [Self::Amx, Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
-
-    /// The name that `SCI_KERNEL` knows it by.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Amx => "amx",
-            Self::Avx512 => "avx512",
-            Self::Avx2 => "avx2",
-            Self::Neon => "neon",
-            Self::Portable => "portable",
-        }
-    }
-
-    /// Whether this machine has it.
-    pub fn available(self) -> bool {
-        match self {
-            #[cfg(target_arch = "x86_64")]
-            Self::Amx => super::amx::available(),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => is_x86_feature_detected!("avx512f"),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
-            #[cfg(target_arch = "aarch64")]
-            Self::Neon => std::arch::is_aarch64_feature_detected!("neon"),
-            Self::Portable => true,
-            #[allow(unreachable_patterns)]
-            _ => false,
-        }
-    }
-
-    /// The one to use: `SCI_KERNEL` if it is set, else the fastest that this machine has. Read once per process.
-    ///
-    /// # Errors
-    /// [`KernelError::UnknownIsa`] or [`KernelError::MissingIsa`] when `SCI_KERNEL` asks for what there is not.
-    pub fn detect() -> Result<Self, KernelError> {
-        static CHOICE: OnceLock<Result<Isa, KernelError>> = OnceLock::new();
-        CHOICE
-            .get_or_init(|| match std::env::var("SCI_KERNEL") {
-                Ok(name) => Self::named(&name),
-                Err(std::env::VarError::NotPresent) => {
-                    Ok(Self::ALL.into_iter().find(|isa| isa.available()).unwrap_or(Self::Portable))
-                }
-                Err(std::env::VarError::NotUnicode(name)) => {
-                    Err(KernelError::UnknownIsa(name.to_string_lossy().into()))
-                }
-            })
-            .clone()
-    }
-
-    /// The one to use where gradients are computed: as [`Isa::detect`], but for the matrix unit, which gains nothing there.
-    ///
-    /// # Errors
-    /// As [`Isa::detect`].
-    pub(super) fn detect_for_gradients() -> Result<Self, KernelError> {
-        Self::detect().map(|isa| if isa == Self::Amx { Self::Avx512 } else { isa })
-    }
-
-    /// The instruction set of that name, if this machine has it.
-    ///
-    /// # Errors
-    /// [`KernelError::UnknownIsa`] or [`KernelError::MissingIsa`].
-    pub fn named(name: &str) -> Result<Self, KernelError> {
-        let isa =
-            Self::ALL.into_iter().find(|isa| isa.name() == name).ok_or_else(|| KernelError::UnknownIsa(name.into()))?;
-        isa.checked()
-    }
-
-    /// Itself, if this machine has it.
-    pub(super) fn checked(self) -> Result<Self, KernelError> {
-        if self.available() { Ok(self) } else { Err(KernelError::MissingIsa(self.name())) }
-    }
-
-    /// Vectors of output channels that one register tile holds ([`Simd::VECS`]).
-    pub(super) fn vecs(self) -> usize {
-        if matches!(self, Self::Amx | Self::Avx512) { 2 } else { 1 }
-    }
-}
 
 /// A vector of [`LANES`] f32 numbers.
 ///
@@ -435,7 +337,7 @@ mod arm {
 /// Its safety contract: that of `body`, and `isa.available()`.
 macro_rules! entry {
     ($vis:vis fn $name:ident = $body:ident($($arg:ident: $ty:ty),* $(,)?)) => {
-        $vis unsafe fn $name(isa: $crate::kernels::simd::Isa, $($arg: $ty),*) {
+        $vis unsafe fn $name(isa: $crate::kernels::isa::Isa, $($arg: $ty),*) {
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx512f")]
             unsafe fn avx512($($arg: $ty),*) {
@@ -458,11 +360,11 @@ macro_rules! entry {
             unsafe {
                 match isa {
                     #[cfg(target_arch = "x86_64")]
-                    $crate::kernels::simd::Isa::Amx | $crate::kernels::simd::Isa::Avx512 => avx512($($arg),*),
+                    $crate::kernels::isa::Isa::Amx | $crate::kernels::isa::Isa::Avx512 => avx512($($arg),*),
                     #[cfg(target_arch = "x86_64")]
-                    $crate::kernels::simd::Isa::Avx2 => avx2($($arg),*),
+                    $crate::kernels::isa::Isa::Avx2 => avx2($($arg),*),
                     #[cfg(target_arch = "aarch64")]
-                    $crate::kernels::simd::Isa::Neon => neon($($arg),*),
+                    $crate::kernels::isa::Isa::Neon => neon($($arg),*),
                     _ => $body::<$crate::kernels::simd::Portable>($($arg),*),
                 }
             }

@@ -6,17 +6,17 @@
 //! `∂g = Gᵀ[Σ (Bᵀ d B) ⊙ (A ∂y Aᵀ)]G`, again 36 products.
 
 use super::blocked::{Pixel, View, ZERO, floats, floats_mut};
+use super::geometry::{GradStrip, Panel, Strip, Weights};
 use super::scratch::Slot;
 use super::simd::{LANES, Simd, entry};
 use super::tile::{Out, Run, outer, product};
-use super::{GradStrip, Panel, Strip, Weights};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::iter::StepBy;
 use std::mem::MaybeUninit;
 use std::slice::IterMut;
 
-/// Interpolation points; see the module header for the choice.
+/// Interpolation points; see `docs/kernels.md` for the choice.
 const P: f64 = 0.625;
 const Q: f64 = 1.5;
 

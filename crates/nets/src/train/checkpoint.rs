@@ -3,12 +3,12 @@
 //! The random generator needs no state of its own: each step draws from the stream of its number.
 
 use super::config::TrainConfig;
-use crate::weights::write_atomically;
+use crate::weights::{read_safetensors, write_atomically};
 use crate::{Error, Result};
-use candle_core::{DType, Device, Tensor};
-use safetensors::SafeTensors;
+use candle_core::{DType, Tensor};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use serde_json::{Map, Value};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 const KEY: &str = "checkpoint";
@@ -23,6 +23,10 @@ pub(super) struct Meta {
     pub(super) config: TrainConfig,
     /// Solves in progress, in their order.
     pub(super) pool: Vec<PoolMeta>,
+    /// Whether it began with random weights.
+    pub(super) random: bool,
+    /// The share of the settings' learning rate that is left after divergences.
+    pub(super) rate: f64,
 }
 
 /// What a solve in progress was drawn with, and the iterations that it has behind it and is to have.
@@ -34,8 +38,28 @@ pub(super) struct PoolMeta {
 }
 
 impl Meta {
-    pub(super) fn new(step: u64, adam_steps: u64, config: TrainConfig, pool: Vec<PoolMeta>) -> Self {
-        Self { schema: SCHEMA, step, adam_steps, config, pool }
+    pub(super) fn new(
+        step: u64,
+        adam_steps: u64,
+        config: TrainConfig,
+        pool: Vec<PoolMeta>,
+        random: bool,
+        rate: f64,
+    ) -> Self {
+        Self { schema: SCHEMA, step, adam_steps, config, pool, random, rate }
+    }
+
+    /// What is wrong with it.
+    fn fault(&self) -> Option<String> {
+        let steps = self.config.training.steps;
+        if self.schema != SCHEMA {
+            return Some(format!("its schema is {}, this program reads {SCHEMA}", self.schema));
+        }
+        let legal = self.step <= steps && self.adam_steps <= self.step && self.rate > 0.0 && self.rate <= 1.0;
+        (!legal).then(|| {
+            let Self { step, adam_steps, rate, .. } = self;
+            format!("step {step} of {steps}, {adam_steps} of the optimiser, {rate} of the rate")
+        })
     }
 }
 
@@ -56,44 +80,54 @@ pub(super) fn write(path: &Path, meta: &Meta, tensors: &BTreeMap<String, Tensor>
 pub(super) fn read(path: &Path) -> Result<(Meta, BTreeMap<String, Tensor>)> {
     let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     let refuse = |why: String| Error::format(path, format!("not a whole checkpoint: {why}"));
-    let file = SafeTensors::deserialize(&bytes).map_err(|e| refuse(e.to_string()))?;
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| refuse(e.to_string()))?;
-    let json = header.metadata().as_ref().and_then(|m| m.get(KEY));
+    let (stored, header) = read_safetensors(&bytes).map_err(refuse)?;
+    let json = header.get(KEY);
     let json = json.ok_or_else(|| refuse("it is a safetensors file that was not written by a training run".into()))?;
     let meta: Meta = serde_json::from_str(json).map_err(|e| refuse(e.to_string()))?;
-    if meta.schema != SCHEMA {
-        return Err(refuse(format!("its schema is {}, this program reads {SCHEMA}", meta.schema)));
+    if let Some(fault) = meta.fault() {
+        return Err(refuse(fault));
     }
     let mut tensors = BTreeMap::new();
-    for (name, view) in file.tensors() {
-        let tensor = Tensor::from_raw_buffer(view.data(), DType::F32, view.shape(), &Device::Cpu)?;
-        if view.dtype() != safetensors::Dtype::F32 {
-            return Err(refuse(format!("tensor {name} is of type {:?}", view.dtype())));
+    for (name, tensor) in stored {
+        if tensor.dtype != DType::F32 {
+            return Err(refuse(format!("tensor {name} is of type {:?}", tensor.dtype)));
         }
-        tensors.insert(name, tensor);
+        if let Some(value) = tensor.not_finite() {
+            return Err(refuse(format!("tensor {name} holds {value}")));
+        }
+        tensors.insert(name, tensor.into_tensor()?);
     }
     Ok((meta, tensors))
 }
 
+/// What may differ in a run that goes on: where its data lies, and how it is watched and saved.
+const FREE: [&str; 5] = ["data.video", "data.photos", "data.validation", "validation", "checkpoint"];
+
 /// Refuses to go on with settings that would make another run of it.
 pub(super) fn check_same_run(path: &Path, saved: &TrainConfig, now: &TrainConfig) -> Result<()> {
     let value = |config: &TrainConfig| serde_json::to_value(config).map_err(|e| Error::format(path, e.to_string()));
-    let (saved, now) = (value(saved)?, value(now)?);
-    for part in ["seed", "network", "data", "noise", "snapshots", "training"] {
-        // Where the data lies may change; what is cut from it may not.
-        let strip = |config: &serde_json::Value| {
-            let mut part = config[part].clone();
-            if let Some(table) = part.as_object_mut() {
-                ["video", "photos", "validation"].iter().for_each(|key| drop(table.remove(*key)));
-            }
-            part
-        };
-        let (saved, now) = (strip(&saved), strip(&now));
-        if saved != now {
-            let why =
-                format!("it was trained with {part} = {saved}, this run has {now}; resuming needs equal settings");
-            return Err(Error::format(path, why));
-        }
+    let mut found = Vec::new();
+    differences("", &value(saved)?, &value(now)?, &mut found);
+    if found.is_empty() {
+        return Ok(());
     }
-    Ok(())
+    let why = format!("it is of a run with {}; only {} may change when it goes on", found.join(", "), FREE.join(", "));
+    Err(Error::format(path, why))
+}
+
+/// The keys of what differs, with both values.
+fn differences(key: &str, saved: &Value, now: &Value, found: &mut Vec<String>) {
+    if saved == now || FREE.contains(&key) {
+        return;
+    }
+    let (Value::Object(before), Value::Object(after)) = (saved, now) else {
+        found.push(format!("{key} = {saved}, not {now}"));
+        return;
+    };
+    let names: BTreeSet<&String> = before.keys().chain(after.keys()).collect();
+    for name in names {
+        let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+        let of = |table: &Map<String, Value>| table.get(name).cloned().unwrap_or_default();
+        differences(&key, &of(before), &of(after), found);
+    }
 }

@@ -1,5 +1,6 @@
 //! What a training run is: a plain, checked description that a TOML file maps to one to one.
 
+use crate::fastdvdnet::check_widths;
 use crate::kernels::Precision;
 use crate::video::Ends;
 use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, UnfoldingSpec};
@@ -101,6 +102,28 @@ impl NetworkConfig {
             }
             Self::Ddnet { .. } => 3,
         }
+    }
+
+    /// Checks the network's size.
+    fn validate(&self) -> Result<()> {
+        let checked = match *self {
+            Self::Ffdnet { channels, width, depth } => Self::ffdnet(channels, width, depth).validate().map(drop),
+            Self::Fastdvdnet { channels, widths, .. } => Self::fastdvdnet(channels, widths).block().map(drop),
+            Self::Ddnet { widths, .. } => check_widths(widths),
+            Self::Unfolding { channels, iterations, widths, depth } => {
+                Self::unfolding(channels, iterations, widths, depth).validate().map(drop)
+            }
+        };
+        // The network knows its keys, not the table that they are in.
+        const KEYS: [&str; 5] =
+            ["network.channels", "network.width", "network.widths", "network.depth", "network.iterations"];
+        checked.map_err(|error| match error {
+            Error::Setting { key, value, legal } => {
+                let key = KEYS.into_iter().find(|known| known.ends_with(&format!(".{key}"))).unwrap_or(key);
+                Error::Setting { key, value, legal }
+            }
+            other => other,
+        })
     }
 
     pub(super) fn ffdnet(channels: usize, width: usize, depth: usize) -> FfdnetSpec {
@@ -377,6 +400,7 @@ impl TrainConfig {
         let (data, training) = (&self.data, &self.training);
         let named = !self.name.is_empty() && self.name.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c));
         check(named, "name", &self.name, "letters, digits, '_', '-' and '.'; it becomes a file name")?;
+        self.network.validate()?;
         let sources = data.video.is_some() || data.photos.is_some();
         check(sources, "data", "neither video nor photos", "at least one of them must be given")?;
         check((0.0..=1.0).contains(&data.photo_share), "data.photo_share", data.photo_share, "0 to 1")?;

@@ -190,6 +190,8 @@ pub struct Trainer {
     pool: Pool,
     /// Whether it began with random weights.
     random: bool,
+    /// The share of the settings' learning rate that is left after divergences.
+    rate: f64,
     step: u64,
 }
 
@@ -246,7 +248,19 @@ impl Trainer {
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         let idle = Idle::new(&model.layers().convs(), &vars);
-        Ok(Self { config, data, model, vars, adam, average, idle, pool: Pool::default(), random: true, step: 0 })
+        Ok(Self {
+            config,
+            data,
+            model,
+            vars,
+            adam,
+            average,
+            idle,
+            pool: Pool::default(),
+            random: true,
+            rate: 1.0,
+            step: 0,
+        })
     }
 
     /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
@@ -283,6 +297,11 @@ impl Trainer {
     /// Number of trained values.
     pub fn parameter_count(&self) -> usize {
         self.model.layers().parameter_count()
+    }
+
+    /// The share of the learning rate of the settings that is left after divergences, 1 without any.
+    pub fn rate(&self) -> f64 {
+        self.rate
     }
 
     /// Steps done.
@@ -369,14 +388,14 @@ impl Trainer {
     /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves.
     ///
     /// # Errors
-    /// [`Error::Diverged`] when loss or gradient is not finite; the weights are then those before the step.
+    /// [`Error::Diverged`] when loss or gradient is not finite: [`Trainer::back_off`] is the way to go on then.
     ///
     /// # Panics
     /// Never: [`Trainer::new`] checked the settings.
     pub fn step(&mut self) -> Result<StepReport> {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
-        let learning_rate = self.config.learning_rate(self.step);
+        let learning_rate = self.rate * self.config.learning_rate(self.step);
         let mut lessons = match (&self.config.iterates, &self.config.snapshots) {
             (Some(iterates), _) => self.iterates(iterates, &mut rng)?,
             (_, Some(snapshots)) => self.exercises(&snapshots.clone(), &mut rng)?,
@@ -634,7 +653,8 @@ impl Trainer {
             tensors.insert(format!("means/{}", self.vars[weight].0), Tensor::new(&**means, &Device::Cpu)?);
         }
         let pool = self.pool.state(&mut tensors);
-        checkpoint::write(path, &Meta::new(self.step, self.adam.steps(), self.config.clone(), pool), &tensors)
+        let meta = Meta::new(self.step, self.adam.steps(), self.config.clone(), pool, self.random, self.rate);
+        checkpoint::write(path, &meta, &tensors)
     }
 
     /// Continues from a checkpoint, or from the one before it when the newest is damaged.
@@ -654,6 +674,25 @@ impl Trainer {
                 Ok(Resumed { from: before, refused: Some(error) })
             }
         }
+    }
+
+    /// After a divergence: continues with half the learning rate, which is saved. Not from the last checkpoint, when the weights may have been
+    /// lost already, but from the one before it, if there is one; the last one is given up.
+    ///
+    /// # Errors
+    /// When no checkpoint can be read, or the new one not be written.
+    pub fn back_off(&mut self, path: &Path) -> Result<()> {
+        let rate = self.rate / 2.0;
+        let before = checkpoint::previous(path);
+        match checkpoint::read(&before) {
+            Ok(found) => {
+                self.restore(&before, found)?;
+                std::fs::remove_file(path).map_err(|source| Error::Write { path: path.to_owned(), source })?;
+            }
+            Err(_) => self.restore(path, checkpoint::read(path)?)?,
+        }
+        self.rate = rate;
+        self.save(path)
     }
 
     fn restore(&mut self, path: &Path, (meta, mut tensors): (Meta, BTreeMap<String, Tensor>)) -> Result<()> {
@@ -692,6 +731,8 @@ impl Trainer {
         self.adam.restore(meta.adam_steps, moments);
         centres.into_iter().for_each(|(weight, centre)| self.adam.set_centre(weight, centre));
         self.step = meta.step;
+        self.random = meta.random;
+        self.rate = meta.rate;
         Ok(())
     }
 }

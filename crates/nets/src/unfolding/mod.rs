@@ -77,7 +77,7 @@ impl UnfoldingSpec {
         Some(Self { channels, iterations, widths, depth: blocks.checked_sub(2 * (LEVELS - 1))? })
     }
 
-    fn validate(self) -> Result<Self> {
+    pub(crate) fn validate(self) -> Result<Self> {
         let bad =
             |key, value: usize, legal: &str| Err(Error::Setting { key, value: value.to_string(), legal: legal.into() });
         let width = |w: &usize| !(16..=512).contains(w) || !w.is_multiple_of(16);

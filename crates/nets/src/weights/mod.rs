@@ -3,17 +3,21 @@
 //! A file becomes named f32 tensors; a network takes them only when the names and shapes are exactly its own.
 
 mod bundled;
+mod pickle;
 mod pth;
+mod stored;
 
 use crate::{
     Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, UnfoldingNet,
     UnfoldingSpec,
 };
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 pub use bundled::{bundled_for_iterates, bundled_names};
+use stored::Named;
+pub(crate) use stored::read_safetensors;
 
 /// The network that a set of tensors belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,33 +82,35 @@ impl WeightFile {
     /// As [`WeightFile::read`].
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         let stored = if pth::looks_like(bytes) {
-            pth::read(bytes).map_err(|reason| Error::format(path, reason))?
+            pth::read(bytes)
         } else {
-            candle_core::safetensors::load_buffer(bytes, &Device::Cpu)
-                .map_err(|e| Error::format(path, format!("neither a .pth nor a whole .safetensors file: {e}")))?
-                .into_iter()
-                .collect()
+            read_safetensors(bytes)
+                .map(|(tensors, _)| tensors)
+                .map_err(|e| format!("neither a .pth nor a whole .safetensors file: {e}"))
         };
-        Self::from_stored(path, stored)
+        Self::from_stored(path, stored.map_err(|reason| Error::format(path, reason))?)
     }
 
-    fn from_stored(path: &Path, stored: BTreeMap<String, Tensor>) -> Result<Self> {
+    fn from_stored(path: &Path, stored: Named) -> Result<Self> {
         let mut file = Self { path: path.to_owned(), tensors: BTreeMap::new(), stored: BTreeMap::new() };
         for (name, tensor) in stored {
             let name = name.strip_prefix("module.").unwrap_or(&name).to_owned();
-            let dtype = tensor.dtype();
-            file.stored.insert(name.clone(), dtype);
+            if file.stored.insert(name.clone(), tensor.dtype).is_some() {
+                return Err(Error::format(
+                    path,
+                    format!("holds the tensor {name} twice, with and without \"module.\""),
+                ));
+            }
             if name.ends_with("num_batches_tracked") {
                 continue;
             }
-            if !matches!(dtype, DType::F16 | DType::BF16 | DType::F32 | DType::F64) {
-                return Err(Error::DType { path: path.to_owned(), key: name, dtype });
+            if !tensor.is_float() {
+                return Err(Error::DType { path: path.to_owned(), key: name, dtype: tensor.dtype });
             }
-            let tensor = tensor.to_dtype(DType::F32)?.contiguous()?;
-            if let Some(value) = tensor.flatten_all()?.to_vec1::<f32>()?.into_iter().find(|v| !v.is_finite()) {
+            if let Some(value) = tensor.not_finite() {
                 return Err(Error::NotFinite { path: path.to_owned(), key: name, value });
             }
-            file.tensors.insert(name, tensor);
+            file.tensors.insert(name, tensor.into_tensor()?);
         }
         Ok(file)
     }
@@ -202,27 +208,40 @@ pub enum Storage {
 /// Writes tensors to a `.safetensors` file: to a temporary name first, so that the file is never half-written.
 ///
 /// # Errors
-/// [`Error::Write`].
+/// [`Error::Write`]; [`Error::Format`] for numbers that are too large for [`Storage::F16`].
 pub fn write_safetensors(path: &Path, tensors: &BTreeMap<String, Tensor>, storage: Storage) -> Result<()> {
     let dtype = match storage {
         Storage::F32 => DType::F32,
         Storage::F16 => DType::F16,
     };
-    let tensors =
-        tensors.iter().map(|(name, t)| Ok((name.as_str(), t.to_dtype(dtype)?))).collect::<Result<Vec<_>>>()?;
-    let bytes = safetensors::serialize(tensors, None).map_err(|e| Error::format(path, e.to_string()))?;
+    let convert = |tensor: &Tensor| -> candle_core::Result<(Tensor, bool)> {
+        let stored = tensor.to_dtype(dtype)?;
+        let largest: f32 = stored.abs()?.max_all()?.to_dtype(DType::F32)?.to_scalar()?;
+        Ok((stored, storage == Storage::F32 || largest.is_finite()))
+    };
+    let mut converted = Vec::new();
+    for (name, tensor) in tensors {
+        let (stored, fits) = convert(tensor)?;
+        if !fits {
+            let why = format!("tensor {name} holds numbers beyond 65504, the largest of f16: it must be stored as f32");
+            return Err(Error::format(path, why));
+        }
+        converted.push((name.as_str(), stored));
+    }
+    let bytes = safetensors::serialize(converted, None).map_err(|e| Error::format(path, e.to_string()))?;
     write_atomically(path, &bytes, |_| Ok(()))
 }
 
-/// Writes to a temporary name beside `path`, then renames; `before` runs between the two.
+/// Writes to a hidden file beside `path`, then renames; `before` runs between the two. The hidden file has one name, so that a program that
+/// is killed again and again does not leave more than one.
 pub(crate) fn write_atomically(
     path: &Path,
     bytes: &[u8],
     before: impl FnOnce(&Path) -> std::io::Result<()>,
 ) -> Result<()> {
-    let fail = |source| Error::Write { path: path.to_owned(), source };
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".tmp");
+    let mut name = std::ffi::OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(".sci-tmp");
     let temporary = path.with_file_name(name);
     let write = || {
         let mut file = std::fs::File::create(&temporary)?;
@@ -231,5 +250,5 @@ pub(crate) fn write_atomically(
         before(path)?;
         std::fs::rename(&temporary, path)
     };
-    write().map_err(fail)
+    write().map_err(|source| Error::Write { path: path.to_owned(), source })
 }

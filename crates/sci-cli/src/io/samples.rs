@@ -337,14 +337,24 @@ impl Array {
     }
 }
 
-/// Product of a shape, or `None` where it overflows.
+/// Product of a shape, or `None` where that of its lengths, those of 0 left out, is more than an array can have.
 pub fn element_count(shape: &[usize]) -> Option<usize> {
-    shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d))
+    let product = shape.iter().filter(|&&d| d != 0).try_fold(1usize, |n, &d| n.checked_mul(d));
+    let product = product.filter(|&n| isize::try_from(n).is_ok())?;
+    Some(if shape.contains(&0) { 0 } else { product })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lengths_of_an_empty_array_are_counted_too() {
+        assert_eq!(element_count(&[2, 3]), Some(6));
+        assert_eq!(element_count(&[]), Some(1));
+        assert_eq!(element_count(&[2, 0, 3]), Some(0));
+        assert_eq!(element_count(&[0, 1 << 40, 1 << 40]), None);
+    }
 
     #[test]
     fn decodes_every_type_in_both_orders() {

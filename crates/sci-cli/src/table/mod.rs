@@ -15,7 +15,7 @@ use serde_json::{Map, Value as Json};
 use toml::de::{DeTable, DeValue, ValueDeserializer};
 use toml::{Spanned, Value};
 
-pub use paths::DATA_VARIABLE;
+pub use paths::{DATA_VARIABLE, find, find_weights};
 pub use source::{ConfigError, Place, Source};
 
 /// Full scale of a σ in a file.
@@ -372,7 +372,7 @@ impl<'s> Table<'s> {
         let value = Spanned::new(self.span.clone(), DeValue::Table(std::mem::take(&mut self.rest)));
         T::deserialize(ValueDeserializer::from(value)).map_err(|e| {
             let (span, message) = (e.span().unwrap_or(0..0), e.message());
-            let Some((key, legal)) = unknown_field(message) else { return self.source.error(&span, message) };
+            let Some((key, legal)) = unknown_field(message) else { return self.source.mismatch(&span, message) };
             self.asked = legal.into_iter().map(|name| (name.to_owned(), None)).collect();
             self.unknown(&span, key)
         })

@@ -17,15 +17,20 @@ pub(super) struct Written<'t> {
     pub(super) span: Range<usize>,
 }
 
-impl Written<'_> {
+impl<'t> Written<'t> {
+    fn at(source: &Source, key: &str, text: &'t str) -> Self {
+        Self { key: key.to_owned(), text, span: source.span(key).unwrap_or(0..0) }
+    }
+
     fn error(&self, source: &Source, problem: impl std::fmt::Display) -> ConfigError {
         source.error(&self.span, format!("`{}` = {:?}{problem}", self.key, self.text))
     }
 }
 
-/// The folders a relative path is looked up in.
+/// The folders a relative path is looked up in: that of the file which names it, the current one, and those of the data.
 fn search_folders(written: &Written<'_>, source: &Source) -> Vec<PathBuf> {
-    let mut folders = vec![source.folder(&written.span)];
+    let mut folders = vec![source.folder(&written.span), PathBuf::from(".")];
+    folders.dedup();
     if let Some(data) = env::var_os(DATA_VARIABLE).filter(|v| !v.is_empty()).map(PathBuf::from) {
         folders.extend([data.clone(), data.join("data"), data.join("weights")]);
     }
@@ -43,11 +48,27 @@ pub(super) fn locate(written: &Written<'_>, source: &Source) -> Result<PathBuf, 
     if Path::new(written.text).is_relative() {
         let looked: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
         problem += &format!("; looked in {}", looked.join(", "));
-        if folders.len() == 1 {
+        if env::var_os(DATA_VARIABLE).is_none_or(|v| v.is_empty()) {
             problem += &format!(" ({DATA_VARIABLE} is not set: it may name a folder with data/ and weights/)");
         }
     }
     Err(written.error(source, problem))
+}
+
+/// The absolute path of the file or folder that a dotted key of a source names.
+///
+/// # Errors
+/// If there is none.
+pub fn find(source: &Source, key: &str, path: &Path) -> Result<PathBuf, ConfigError> {
+    locate(&Written::at(source, key, &path.to_string_lossy()), source)
+}
+
+/// The same for weights, which may be `bundled:NAME`.
+///
+/// # Errors
+/// If there are none.
+pub fn find_weights(source: &Source, key: &str, path: &Path) -> Result<PathBuf, ConfigError> {
+    locate_weights(&Written::at(source, key, &path.to_string_lossy()), source)
 }
 
 /// Published weight files by the name under which configs know them: what it is and where it comes from.

@@ -194,9 +194,27 @@ impl Source {
         ConfigError { place: Place::File(self.path().to_owned()), problem: problem.into() }
     }
 
+    /// The place of a dotted key, or of the last table on the way to it that is there.
+    pub fn span(&self, key: &str) -> Option<Range<usize>> {
+        self.tree().ok().and_then(|tree| span_of(&tree, key))
+    }
+
+    /// An error about a value, or a table, that is not what serde expects there.
+    pub fn mismatch(&self, span: &Range<usize>, expectation: &str) -> ConfigError {
+        let key = self.tree().ok().and_then(|tree| key_at(&tree, span)).unwrap_or_default();
+        let missing = expectation.strip_prefix("missing field `").and_then(|rest| rest.strip_suffix('`'));
+        let problem = match (missing, key.as_str()) {
+            (Some(field), "") => format!("`{field}` is missing"),
+            (Some(field), table) => format!("`{table}.{field}` is missing"),
+            (None, "") => expectation.to_owned(),
+            (None, key) => format!("`{key}` = {} is not legal: {expectation}", self.snippet(span)),
+        };
+        self.error(span, problem)
+    }
+
     /// An error at a dotted key, or at the last table on the way to it that is there.
     pub fn error_at(&self, key: &str, problem: impl Into<String>) -> ConfigError {
-        match self.tree().ok().and_then(|tree| span_of(&tree, key)) {
+        match self.span(key) {
             Some(span) => self.error(&span, problem),
             None => self.file_error(problem),
         }
@@ -338,6 +356,22 @@ fn span_of(tree: &DeTable<'_>, key: &str) -> Option<Range<usize>> {
         found = next;
     }
     Some(found.span())
+}
+
+/// The dotted key of what lies at a span.
+fn key_at(table: &DeTable<'_>, span: &Range<usize>) -> Option<String> {
+    let below = |(key, value): (String, &Spanned<DeValue<'_>>)| {
+        if value.span() == *span {
+            return Some(key);
+        }
+        let deeper = match value.get_ref() {
+            DeValue::Table(table) => key_at(table, span),
+            DeValue::Array(list) => list.iter().position(|item| item.span() == *span).map(|index| index.to_string()),
+            _ => None,
+        };
+        Some(format!("{key}.{}", deeper?))
+    };
+    table.iter().map(|(key, value)| (key.get_ref().to_string(), value)).find_map(below)
 }
 
 /// Moves every span of a value parsed from a part of the text.

@@ -1,61 +1,31 @@
 //! Frames to train on: folders of images, decoded once and kept as bytes.
 
-use std::env;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use nets::WeightFile;
-use nets::train::{Frame, TrainConfig, TrainData, frame_from_rgb};
+use nets::train::{Frame, TrainData, frame_from_rgb};
 use rayon::prelude::*;
 
 use crate::io;
-
-/// Environment variable with the folder that data is looked up in.
-const DATA_VARIABLE: &str = "SCI_DATA";
+use crate::training::Training;
 
 /// Reads what the settings name.
-pub(super) fn load(config: &TrainConfig, file: &Path) -> anyhow::Result<TrainData> {
+pub(super) fn load(training: &Training) -> anyhow::Result<TrainData> {
+    let config = &training.config;
     let channels = config.network.channels();
-    let find = |path: &Path| locate(path, file);
-    let clips = |path: &Path| clips(&find(path)?, channels);
+    let clips = |key: &str, path: &Path| clips(&training.find(key, path)?, channels).context(key.to_owned());
     let share = config.data.photo_share;
     let videos = match &config.data.video {
-        Some(path) if share < 1.0 => clips(path).context("data.video")?,
+        Some(path) if share < 1.0 => clips("data.video", path)?,
         _ => Vec::new(),
     };
     let photos = match &config.data.photos {
-        Some(path) if share > 0.0 => frames(&find(path)?, channels).context("data.photos")?,
+        Some(path) if share > 0.0 => frames(&training.find("data.photos", path)?, channels).context("data.photos")?,
         _ => Vec::new(),
     };
-    let mut validation = clips(&config.data.validation).context("data.validation")?;
+    let mut validation = clips("data.validation", &config.data.validation)?;
     validation.iter_mut().for_each(|clip| clip.truncate(config.validation.frames));
     Ok(TrainData { videos, photos, validation })
-}
-
-/// The weights a run begins with.
-pub(super) fn weights(path: &Path, file: &Path) -> anyhow::Result<WeightFile> {
-    let bundled = path.to_str().is_some_and(|p| p.starts_with("bundled:"));
-    let path = if bundled { path.to_owned() } else { locate(path, file).context("weights")? };
-    Ok(WeightFile::read(&path)?)
-}
-
-/// A relative path is looked up beside the training file, then in the current folder, then in SCI_DATA.
-fn locate(path: &Path, file: &Path) -> anyhow::Result<PathBuf> {
-    let beside = file.parent().map_or(PathBuf::new(), Path::to_owned);
-    let mut folders = vec![beside, PathBuf::new()];
-    folders.extend(env::var_os(DATA_VARIABLE).filter(|v| !v.is_empty()).map(PathBuf::from));
-    let tried: Vec<PathBuf> = folders.into_iter().map(|folder| folder.join(path)).collect();
-    match tried.iter().find(|path| path.exists()) {
-        Some(found) => Ok(found.clone()),
-        None => {
-            let list: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
-            bail!(
-                "no such file or folder: {} (looked for {}; {DATA_VARIABLE} can name the folder it is in)",
-                path.display(),
-                list.join(", ")
-            )
-        }
-    }
 }
 
 fn entries(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {

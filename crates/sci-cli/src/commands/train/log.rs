@@ -1,13 +1,15 @@
 //! The log of a training run, one JSON object a line, and the plot made from it.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use nets::train::{Score, StepReport};
 use plotters::prelude::*;
 use serde::{Deserialize, Serialize};
+
+use crate::io::output::write_atomically;
 
 /// Steps that one line sums up.
 const STEPS_PER_LINE: u64 = 10;
@@ -18,6 +20,13 @@ enum Line {
     Validation {
         step: u64,
         validation: Vec<Psnr>,
+    },
+    /// A divergence after which the run went on from `step`.
+    BackedOff {
+        step: u64,
+        diverged: String,
+        /// The share of the learning rate that is left.
+        rate: f64,
     },
     /// Means over [`STEPS_PER_LINE`] steps, the last of which is `step`.
     Steps {
@@ -35,7 +44,8 @@ enum Line {
 struct Psnr {
     /// Nothing for clips that were reconstructed from a measurement.
     sigma: Option<f32>,
-    psnr_db: f64,
+    /// Nothing if it is not finite, as JSON has no such number.
+    psnr_db: Option<f64>,
 }
 
 fn legend(sigma: Option<f32>) -> String {
@@ -45,7 +55,7 @@ fn legend(sigma: Option<f32>) -> String {
 impl Line {
     fn at(&self) -> u64 {
         match self {
-            Self::Steps { step, .. } | Self::Validation { step, .. } => *step,
+            Self::Steps { step, .. } | Self::Validation { step, .. } | Self::BackedOff { step, .. } => *step,
         }
     }
 }
@@ -60,15 +70,19 @@ pub(super) struct Log {
 }
 
 impl Log {
-    /// Opens the log of a run that has come to `step`; lines of later steps, which a resumed run does again, are dropped.
+    /// Opens the log of a run that has come to `step`; lines of later steps, which it does again, are dropped, and one that was cut short.
     pub(super) fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
-        let before = if step == 0 { String::new() } else { std::fs::read_to_string(path).unwrap_or_default() };
-        let lines: Vec<Line> =
-            before.lines().filter_map(|l| serde_json::from_str(l).ok()).filter(|l: &Line| l.at() <= step).collect();
-        let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
-        let mut log = Self { path: path.to_owned(), file: BufWriter::new(file), lines: Vec::new(), open: Vec::new() };
-        lines.into_iter().try_for_each(|line| log.write(line))?;
-        Ok(log)
+        let before = match std::fs::read_to_string(path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
+            read => read.with_context(|| format!("cannot read {}", path.display()))?,
+        };
+        let kept = before.lines().filter_map(|text| Some((text, serde_json::from_str::<Line>(text).ok()?)));
+        let (texts, lines): (Vec<&str>, Vec<Line>) = kept.filter(|(_, line)| line.at() <= step).unzip();
+        // In one step, so that nothing is lost if the program ends here.
+        write_atomically(path, |file| texts.iter().try_for_each(|text| writeln!(file, "{text}")))?;
+        let file = File::options().append(true).open(path);
+        let file = BufWriter::new(file.with_context(|| format!("cannot write {}", path.display()))?);
+        Ok(Self { path: path.to_owned(), file, lines, open: Vec::new() })
     }
 
     fn write(&mut self, line: Line) -> anyhow::Result<()> {
@@ -97,17 +111,25 @@ impl Log {
 
     /// Logs a validation and puts it into words.
     pub(super) fn validation(&mut self, step: u64, scores: &[Score]) -> anyhow::Result<String> {
-        let validation = scores.iter().map(|s| Psnr { sigma: s.sigma, psnr_db: s.psnr_db }).collect();
+        let validation = scores
+            .iter()
+            .map(|s| Psnr { sigma: s.sigma, psnr_db: Some(s.psnr_db).filter(|db| db.is_finite()) })
+            .collect();
         self.write(Line::Validation { step, validation })?;
         let scores: Vec<String> = scores.iter().map(|s| format!("{}: {:.2} dB", legend(s.sigma), s.psnr_db)).collect();
         Ok(format!("step {step}   {}", scores.join("   ")))
+    }
+
+    /// Logs that the run went back to a step.
+    pub(super) fn backed_off(&mut self, step: u64, diverged: &str, rate: f64) -> anyhow::Result<()> {
+        self.write(Line::BackedOff { step, diverged: diverged.to_owned(), rate })
     }
 
     /// The latest loss, and how many channels have begun anew.
     pub(super) fn message(&self) -> String {
         let steps = self.lines.iter().filter_map(|line| match line {
             Line::Steps { loss, revived, .. } => Some((*loss, *revived)),
-            Line::Validation { .. } => None,
+            Line::Validation { .. } | Line::BackedOff { .. } => None,
         });
         let Some((loss, revived)) = steps.reduce(|(_, before), (loss, revived)| (loss, before + revived)) else {
             return String::new();
@@ -132,8 +154,9 @@ impl Log {
         let mut curves: Vec<Curve> = Vec::new();
         for line in &self.lines {
             let Line::Validation { step, validation } = line else { continue };
-            for score in validation.iter().filter(|s| s.psnr_db.is_finite()) {
-                let point = (*step as f64, score.psnr_db);
+            for score in validation {
+                let Some(psnr_db) = score.psnr_db else { continue };
+                let point = (*step as f64, psnr_db);
                 match curves.iter_mut().find(|(sigma, _)| *sigma == score.sigma) {
                     Some((_, points)) => points.push(point),
                     None => curves.push((score.sigma, vec![point])),
