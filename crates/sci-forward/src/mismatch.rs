@@ -241,7 +241,7 @@ mod tests {
         let found = MaskMismatch { shift: [-1.0, 0.4], ..MaskMismatch::default() }.reach((5, 6));
         let expected = Array2::from_shape_fn((5, 6), |(i, j)| i < 4 && j > 0);
         assert_eq!(found, expected);
-        assert!(!MaskMismatch { rotation: 1.0, ..MaskMismatch::default() }.reach((100, 100))[[0, 50]]);
+        assert!(!MaskMismatch { rotation: 1.0, ..MaskMismatch::default() }.reach((100, 100))[[0, 99]]);
     }
 
     #[test]

@@ -108,8 +108,9 @@ fn motion(masks: ArrayView3<'_, f32>) -> Option<[isize; 2]> {
     if frames < 2 || height.min(width) <= 2 * FARTHEST as usize + 1 {
         return None;
     }
+    let (bottom, right) = (height as isize - FARTHEST, width as isize - FARTHEST);
     let inside = |mask: ArrayView2<'_, f32>| {
-        mask.slice(s![FARTHEST..-FARTHEST, FARTHEST..-FARTHEST]).iter().map(|&c| f64::from(c)).collect::<Vec<_>>()
+        mask.slice(s![FARTHEST..bottom, FARTHEST..right]).iter().map(|&c| f64::from(c)).collect::<Vec<_>>()
     };
     let alike = |step: [isize; 2]| {
         let pairs = (1..frames).map(|t| {
