@@ -92,7 +92,7 @@ impl Gradients {
 }
 
 /// Maps a result `[T, C, H, W]` to its loss, and the gradient by that result.
-pub type LossOfResult<'l> = dyn Fn(ArrayView4<'_, f32>) -> Result<(f32, Array4<f32>)> + 'l;
+pub type LossOfResult<'l> = dyn Fn(ArrayView4<'_, f32>) -> Result<(f32, Array4<f32>), BoxError> + 'l;
 
 impl Recipe {
     /// The result `[T, C, H, W]` of all calls.
@@ -182,7 +182,7 @@ impl Recipe {
             let input = Var::from_tensor(&tensor(call.input.clone())?)?;
             let v = self.denoised(network, &input, call)?;
             let values = Array4::from_shape_vec(v.dims4()?, v.flatten_all()?.to_vec1::<f32>()?).map_err(unusable)?;
-            let (own, mut upstream) = loss(values.view())?;
+            let (own, mut upstream) = loss(values.view()).map_err(unusable)?;
             upstream *= share;
             if let Some(back) = back.take() {
                 upstream += &back;

@@ -27,7 +27,7 @@ use nets::{Network, Parameters};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use sci_forward::{MaskOperator, MaskStack, Measurement};
+use sci_forward::{MaskOperator, MaskStack, Measurement, MeasurementError};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -266,9 +266,8 @@ fn judging_crops(scenes: &[Scene<'_>], config: &SplitConfig) -> Result<Vec<Crop>
 
 impl Crop {
     /// Mean of `(y − H T v)² / Σ C²` over the pixels asked of, and its gradient by v.
-    fn loss(&self, v: ArrayView4<'_, f32>) -> nets::Result<(f32, Array4<f32>)> {
-        let failed = |e: sci_forward::MeasurementError| nets::Error::Data(e.to_string());
-        let mut weighted = self.whole.residual(v).map_err(failed)?;
+    fn loss(&self, v: ArrayView4<'_, f32>) -> std::result::Result<(f32, Array4<f32>), MeasurementError> {
+        let mut weighted = self.whole.residual(v)?;
         let count = self.asked.iter().filter(|&&asked| asked).count() as f32;
         let mut sum = 0f64;
         Zip::from(&mut weighted).and(&self.asked).and(self.whole.operator().gram()).for_each(|r, &asked, &gram| {
@@ -311,7 +310,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
             let Some(crop) = scene.crop(config.side, &mut rng, hide) else { return Ok(None) };
             let calls = (first..recipe.sigmas.len()).collect();
             let calls = recipe.record(&crop.given, &mut now.clone(), calls)?;
-            Ok(Some(recipe.gradient(&crop.given, &calls, &self.net, &self.vars, &|v| crop.loss(v))?))
+            Ok(Some(recipe.gradient(&crop.given, &calls, &self.net, &self.vars, &|v| Ok(crop.loss(v)?))?))
         };
         let lessons = (0..config.crops).into_par_iter().map(lesson).collect::<Result<Vec<_>>>()?;
         let lessons: Vec<Gradients> = lessons.into_iter().flatten().collect();
