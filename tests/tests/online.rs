@@ -140,7 +140,6 @@ fn splitting_wants_one_solve_to_learn_through() {
         ("solver.kind=\"admm\"", "`solver.kind` is another"),
         ("solver.momentum=\"zero\"", "`solver.momentum` is zero"),
         ("solver.start=\"adjoint\"", "`solver.start` is another"),
-        ("denoiser={kind=\"tv\"}", "no network"),
         ("stage=[{sigma=9,iterations=1},{denoiser={kind=\"tv\"},iterations=1}]", "`denoiser` is another"),
         ("online.interval=2", "`online.interval` has no effect without online.loss"),
     ] {

@@ -353,7 +353,7 @@ mod tests {
     #[test]
     fn every_shipped_experiment_is_right() {
         let mut checked = 0;
-        for folder in ["gray", "color", "bench", "."] {
+        for folder in ["gray", "color", "real", "bench", "."] {
             for entry in std::fs::read_dir(configs().join(folder)).unwrap() {
                 let path = entry.unwrap().path();
                 if path.extension().is_some_and(|e| e == "toml") && !path.ends_with("expected.toml") {

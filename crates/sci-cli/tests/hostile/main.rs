@@ -11,7 +11,8 @@ use std::io::{Cursor, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
-use ndarray::{Array3, Array4};
+use ndarray::{Array3, Array4, ArrayViewD};
+use ndarray_npy::NpzWriter;
 use nets::Layers;
 use nets::WeightFile;
 use nets::weights::{Storage, network, write_safetensors};
@@ -183,6 +184,8 @@ fn damaged_files_are_harmless() {
     let mut zip = Cursor::new(Vec::new());
     npy::write_npz(&mut zip, &[("mask", ramp.view().into_dyn())]).unwrap();
     check(".npz", zip.get_ref(), |b| npy::read_npz(b, &["mask"]).is_ok());
+    let packed = compressed(&[("mask", ramp.view().into_dyn())]);
+    check(".npz, compressed", &packed, |b| npy::read_npz(b, &["mask"]).is_ok());
 
     let mut gif = Vec::new();
     video::write_gif(&mut gif, Array4::from_elem((3, 1, 9, 11), 0.4).view(), 10).unwrap();
@@ -228,11 +231,17 @@ fn damaged_files_are_harmless() {
     attacks(dir.path());
 }
 
+/// An `.npz` as `numpy.savez_compressed` writes it.
+fn compressed(arrays: &[(&str, ArrayViewD<'_, f32>)]) -> Vec<u8> {
+    let mut npz = NpzWriter::new_compressed(Cursor::new(Vec::new()));
+    arrays.iter().for_each(|(name, array)| npz.add_array(*name, array).unwrap());
+    npz.finish().unwrap().into_inner()
+}
+
 fn damaged_scenes(path: &Path, ramp: &Array3<f32>) {
     let (mask, meas) = (ramp.mapv(|v| v.min(1.0)), ramp.sum_axis(ndarray::Axis(0)));
-    let mut zip = Cursor::new(Vec::new());
-    npy::write_npz(&mut zip, &[("mask", mask.view().into_dyn()), ("meas", meas.view().into_dyn())]).unwrap();
-    check("scene, .npz", zip.get_ref(), |b| is_scene(path, b));
+    let packed = compressed(&[("mask", mask.view().into_dyn()), ("meas", meas.view().into_dyn())]);
+    check("scene, .npz", &packed, |b| is_scene(path, b));
     check("scene, .mat v7", include_bytes!("../../../../tests/fixtures/scene_v7.mat"), |b| is_scene(path, b));
 }
 
