@@ -6,6 +6,7 @@
 //! Source: the `.npy` format, versions 1.0 to 3.0, `numpy.lib.format`.
 
 use std::io::{Cursor, Read, Seek, Write};
+use std::ops::Range;
 
 use ndarray::{ArrayViewD, Data, Dimension};
 use ndarray_npy::{NpzWriter, WriteNpyError, WriteNpyExt, WriteNpzError};
@@ -38,10 +39,23 @@ fn bad(reason: impl Into<String>) -> ReadError {
 /// [`ReadError`] if the header is not a NumPy header, the type is not a real number, or fewer bytes follow than the
 /// shape needs.
 pub fn read_npy(bytes: &[u8]) -> Result<Array, ReadError> {
-    read_npy_within(bytes, &mut Budget::for_file(bytes.len()))
+    let layout = layout(bytes)?;
+    let raw = bytes[layout.data.clone()].to_vec();
+    layout.decode(raw, &mut Budget::for_file(bytes.len()))
 }
 
-fn read_npy_within(bytes: &[u8], budget: &mut Budget) -> Result<Array, ReadError> {
+/// What a header says of an array, and where its data lie.
+struct Layout {
+    shape: Vec<usize>,
+    stored: SampleType,
+    endian: Endian,
+    /// Numbers of a sample: 2 of a complex one.
+    parts: usize,
+    fortran: bool,
+    data: Range<usize>,
+}
+
+fn layout(bytes: &[u8]) -> Result<Layout, ReadError> {
     let (header, data) = split_header(bytes)?;
     let (stored, endian, parts) = sample_type(quoted(header, "descr")?)?;
     let fortran = match after(header, "fortran_order")? {
@@ -59,15 +73,25 @@ fn read_npy_within(bytes: &[u8], budget: &mut Budget) -> Result<Array, ReadError
             data.len()
         )));
     };
-    // Complex numbers are there in whole before their real parts are taken out.
-    budget.claim(count, (2 * parts - 1) * stored.decoded_size())?;
-    let samples = Samples::decode(data[..needed].to_vec(), stored, endian);
-    let samples = match parts {
-        1 => samples,
-        _ => samples.real_parts().ok_or_else(|| bad("complex numbers whose imaginary parts are not all zero"))?,
-    };
-    let samples = if fortran { to_row_major(&samples, &shape) } else { samples };
-    Array::new(shape, samples, stored)
+    let start = bytes.len() - data.len();
+    Ok(Layout { shape, stored, endian, parts, fortran, data: start..start + needed })
+}
+
+impl Layout {
+    /// The array, of the bytes in [`Layout::data`]. What it needs beside them is claimed.
+    fn decode(self, raw: Vec<u8>, budget: &mut Budget) -> Result<Array, ReadError> {
+        let Self { shape, stored, endian, parts, fortran, .. } = self;
+        let count = raw.len() / (parts * stored.size());
+        // Complex numbers are there in whole before their real parts are taken out.
+        budget.claim(count, (2 * parts - 1) * stored.decoded_size())?;
+        let samples = Samples::decode(raw, stored, endian);
+        let samples = match parts {
+            1 => samples,
+            _ => samples.real_parts().ok_or_else(|| bad("complex numbers whose imaginary parts are not all zero"))?,
+        };
+        let samples = if fortran { to_row_major(&samples, &shape) } else { samples };
+        Array::new(shape, samples, stored)
+    }
 }
 
 fn split_header(bytes: &[u8]) -> Result<(&str, &[u8]), ReadError> {
@@ -182,17 +206,30 @@ pub fn read_npz(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError>
         if !wanted.contains(&name.as_str()) {
             continue;
         }
-        let limit = budget.left();
-        let mut raw = Vec::new();
-        member.take(limit as u64 + 1).read_to_end(&mut raw).map_err(|e| broken(&format!("`{name}`: {e}")))?;
-        budget.holds(raw.len(), 1)?;
-        let array = read_npy_within(&raw, &mut budget).map_err(|e| match e {
+        let array = read_member(member, &mut budget).map_err(|e| match e {
             ReadError::Malformed { reason, .. } => broken(&format!("`{name}`: {reason}")),
             other => other,
         })?;
         found.arrays.insert(name, array);
     }
     Ok(found)
+}
+
+/// One array of an archive. Its bytes count as long as they are there.
+fn read_member(member: zip::read::ZipFile<'_, impl Read>, budget: &mut Budget) -> Result<Array, ReadError> {
+    let size = budget.holds(usize::try_from(member.size()).unwrap_or(usize::MAX), 1)?;
+    let mut raw = Vec::with_capacity(size + 1);
+    member.take(size as u64 + 1).read_to_end(&mut raw).map_err(|e| bad(e.to_string()))?;
+    if raw.len() > size {
+        return Err(bad("longer than its archive says"));
+    }
+    budget.claim(size, 1)?;
+    let layout = layout(&raw)?;
+    raw.truncate(layout.data.end);
+    raw.drain(..layout.data.start);
+    let array = layout.decode(raw, budget)?;
+    budget.release(size);
+    Ok(array)
 }
 
 /// Writes one array as `.npy`.

@@ -44,6 +44,11 @@ impl Budget {
         Ok(())
     }
 
+    /// Gives back bytes that were claimed and are not held any more.
+    pub fn release(&mut self, bytes: usize) {
+        self.left = (self.left + bytes).min(self.limit);
+    }
+
     /// The bytes of `count` items of `size` bytes, which are not claimed.
     ///
     /// # Errors
