@@ -101,6 +101,43 @@ fn resuming_is_the_straight_run_bit_for_bit() {
     }
 }
 
+/// Solves of three iterations, of which a step does all, or two, so that they go on from step to step and over a checkpoint.
+#[test]
+fn an_unfolding_network_learns_from_solves_in_progress_and_resumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    for (iterations, at_once) in [(3, 3), (1, 2)] {
+        let network = NetworkConfig::Unfolding { channels: 1, iterations, widths: [16, 16, 16], depth: 1 };
+        let mut config = config(network, 1, 30);
+        config.noise = None;
+        config.snapshots = Some(SnapshotsConfig {
+            frames: [2, 4],
+            density: [0.3, 0.7],
+            masks: MaskKind::ALL.to_vec(),
+            noise: 20.0,
+            noisy: 0.5,
+            holes: 0.1,
+            saturated: 0.2,
+            mask_errors: 0.2,
+            start_iterations: 2,
+            iterations: 3,
+            at_once,
+        });
+        let mut straight = trainer(&config);
+        let before = straight.validate().unwrap();
+        let reports = run(&mut straight, 30);
+        let mut first = trainer(&config);
+        run(&mut first, 9);
+        first.save(&path).unwrap();
+        let mut second = trainer(&config);
+        second.resume(&path).unwrap();
+        assert_eq!(run(&mut second, 21), reports[9..]);
+        assert!(bits(&second) == bits(&straight));
+        let after = straight.validate().unwrap();
+        assert!(after[0].psnr_db > before[0].psnr_db, "{before:?} {after:?}");
+    }
+}
+
 /// The same run on the iterates of a solver, one clip a step.
 fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.noise = None;
