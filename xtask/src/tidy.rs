@@ -19,8 +19,6 @@ const FORBIDDEN: [(&str, &[&str]); 5] = [
     ("xtask", &["candle-core", "sci-forward", "admm", "nets", "online", "sci-cli"]),
 ];
 const MAX_LINES: usize = 800;
-/// Circles of imports that are still there: the crate, and the folder of the modules.
-const CIRCLES: [(&str, &str); 0] = [];
 
 /// Checks every rule.
 pub(crate) fn run() -> anyhow::Result<()> {
@@ -93,17 +91,13 @@ fn toml(file: &Path) -> Option<String> {
     text.parse::<toml::Table>().err().map(|e| format!("{}: {}", file.display(), e.message()))
 }
 
-/// Modules of a crate that import each other, but for those that are known; and those that are known and are none any more.
+/// Modules of a crate that import each other.
 fn circles(name: &str) -> Vec<String> {
     let found = circles::of(&root().join("crates").join(name).join("src"));
-    let known = |folder: &str| CIRCLES.contains(&(name, folder));
-    let new = found.iter().filter(|(folder, _)| !known(folder)).map(|(folder, modules)| {
+    let told = found.iter().map(|(folder, modules)| {
         format!("crates/{name}: {} in {folder} import each other in a circle", modules.join(", "))
     });
-    let gone = CIRCLES.iter().filter(|(of, folder)| *of == name && found.iter().all(|(there, _)| there != folder));
-    let gone =
-        gone.map(|(of, folder)| format!("{folder} of crates/{of} has no circle of imports any more: see CIRCLES"));
-    new.chain(gone).collect()
+    told.collect()
 }
 
 /// The code map names every crate and every module at its top.

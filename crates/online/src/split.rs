@@ -300,7 +300,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     /// One update; its loss, or nothing when a number was not finite.
     fn update(&mut self, scenes: &[Scene<'_>], recipe: &Recipe, number: usize) -> Result<Option<f32>> {
         let config = self.config;
-        let now = self.frozen(|_, var| Ok(var.as_detached_tensor()))?;
+        let now = self.constant(&self.net.state())?;
         let first = recipe.sigmas.len().saturating_sub(config.calls);
         let lesson = |i: usize| -> Result<Option<Gradients>> {
             let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
@@ -333,8 +333,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
 
     /// The error of the average of the weights at the pixels that judge.
     fn judge(&self, crops: &[Crop], recipe: &Recipe) -> Result<f64> {
-        let mut state = self.average_of_vars()?;
-        let average = self.frozen(|name, var| Ok(state.remove(name).unwrap_or_else(|| var.as_detached_tensor())))?;
+        let average = self.constant(&self.average()?)?;
         // A network of its own for each thread, which packs its filters once.
         let error = |net: &mut N, crop: &Crop| -> Result<f64> {
             let v = recipe.solve(&crop.given, net)?;
@@ -347,25 +346,16 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     /// The average of the weights as a state of the network.
     fn average(&self) -> Result<BTreeMap<String, Tensor>> {
         let mut state = self.net.state();
-        state.extend(self.average_of_vars()?);
+        for ((name, var), average) in self.vars.iter().zip(&self.average) {
+            state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
+        }
         Ok(state)
     }
 
-    fn average_of_vars(&self) -> Result<BTreeMap<String, Tensor>> {
-        let tensor = |((name, var), average): (&(String, Var), &Vec<f32>)| {
-            Ok((name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?))
-        };
-        self.vars.iter().zip(&self.average).map(tensor).collect()
-    }
-
-    /// The network with these variables as constants, which inference packs once.
-    fn frozen(&self, mut value: impl FnMut(&str, &Var) -> Result<Tensor>) -> Result<N> {
+    /// The network with a state as constants, which inference packs once.
+    fn constant(&self, state: &BTreeMap<String, Tensor>) -> Result<N> {
         let mut net = self.net.clone();
-        let mut state = net.state();
-        for (name, var) in &self.vars {
-            state.insert(name.clone(), value(name, var)?);
-        }
-        net.set_state(&state)?;
+        net.set_state(state)?;
         Ok(net)
     }
 }

@@ -34,7 +34,7 @@ impl Pool {
             // The first ones end early, each at another age, so that a batch has iterations of all kinds.
             let begun: Vec<_> = seeds.par_iter().map(|&seed| begin(seed)).collect::<Result<_>>()?;
             let ends = (0..).map(|i| settings.iterations.min((1 + (self.solves.len() + i) % steps) * settings.at_once));
-            return Ok(begun.into_iter().zip(ends).map(|(solve, end)| solve.ending(end)).collect());
+            return Ok(begun.into_iter().zip(ends).map(|(solve, end)| Exercise { end, ..solve }).collect());
         }
         let next: Vec<_> = self.solves.drain(..batch).collect();
         let renewed = next
@@ -79,7 +79,7 @@ impl Pool {
                 0 => None,
                 iterations => Some(Progress { iterations, result: take("result")?, features: take("features")? }),
             };
-            solves.push(begin(seed)?.gone_on(progress).ending(end));
+            solves.push(Exercise { progress, end, ..begin(seed)? });
         }
         Ok(Self { solves })
     }

@@ -26,9 +26,9 @@ const NEARLY_NONE: f32 = 1.0 / 255.0;
 
 /// A clip and its measurement, and how far its solve has come.
 pub(super) struct Exercise {
-    snapshot: Snapshot,
+    pub(super) snapshot: Snapshot,
     /// The frames as phases.
-    clean: Tensor,
+    pub(super) clean: Tensor,
     /// What it was drawn with.
     pub(super) seed: u64,
     pub(super) progress: Option<Progress>,
@@ -81,18 +81,6 @@ impl Exercise {
     /// Mean square error of each frame of a result.
     pub(super) fn errors(&self, result: &Tensor) -> Result<Vec<f32>> {
         Ok((result - &self.clean)?.sqr()?.flatten_from(1)?.mean(1)?.to_vec1()?)
-    }
-
-    pub(super) fn drawn_with(self, seed: u64) -> Self {
-        Self { seed, ..self }
-    }
-
-    pub(super) fn ending(self, end: usize) -> Self {
-        Self { end, ..self }
-    }
-
-    pub(super) fn gone_on(self, progress: Option<Progress>) -> Self {
-        Self { progress, ..self }
     }
 
     pub(super) fn iterations_done(&self) -> usize {

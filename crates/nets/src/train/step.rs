@@ -373,7 +373,7 @@ impl Trainer {
         let [few, many] = settings.frames;
         let frames = rng.random_range(few..=many);
         let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
-        Ok(Exercise::new(clip.view(), settings, &mut rng)?.drawn_with(seed))
+        Ok(Exercise { seed, ..Exercise::new(clip.view(), settings, &mut rng)? })
     }
 
     /// Solves to go on with, each a lesson of its own as clips differ in length.
