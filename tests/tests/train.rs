@@ -41,8 +41,7 @@ every = 2
 "#;
 
 /// In place of `[noise]`: four lessons a step, or two through the solver.
-const ITERATES: &str =
-    "[iterates]\nsigmas = [50, 25, 12]\nstart_iterations = 2\nframes = [2, 4]\ndensity = [0.3, 0.7]\nholes = 0.1\n";
+const ITERATES: &str = "[camera]\nframes = [2, 4]\ndensity = [0.3, 0.7]\nholes = 0.1\n[iterates]\nsigmas = [50, 25, 12]\nstart_iterations = 2\n";
 
 fn on_iterates(unrolled: bool) -> String {
     let table = format!("{ITERATES}unrolled = {unrolled}\n");

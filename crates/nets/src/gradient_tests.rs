@@ -1,7 +1,10 @@
 //! Gradients of whole networks against central differences of the same network in f64, on candle's own operations.
 
 use crate::layers::Conv;
-use crate::{Ddnet, DdnetSpec, Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network};
+use crate::{
+    Ddnet, DdnetSpec, Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network, Shiftnet,
+    ShiftnetSpec,
+};
 use candle_core::{DType, Device, Tensor};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -83,6 +86,14 @@ fn gradients_of_fastdvdnet_are_slopes() {
 #[test]
 fn gradients_of_ddnet_are_slopes() {
     check(Ddnet::random(DdnetSpec { widths: [3, 2, 4] }, Ends::Circular, 3).unwrap(), [3, 3, 8, 5]);
+}
+
+#[test]
+fn gradients_of_shiftnet_are_slopes() {
+    for channels in [1, 3] {
+        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], depth: 1 };
+        check(Shiftnet::random(spec, 4).unwrap(), [3, channels, 8, 13]);
+    }
 }
 
 #[test]

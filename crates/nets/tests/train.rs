@@ -36,6 +36,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
         weights: None,
         renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 50.0] }),
+        camera: None,
         iterates: None,
         snapshots: None,
         training: TrainingConfig {
@@ -101,6 +102,20 @@ fn resuming_is_the_straight_run_bit_for_bit() {
     }
 }
 
+/// One with every fault.
+fn camera() -> CameraConfig {
+    CameraConfig {
+        frames: [2, 4],
+        density: [0.3, 0.7],
+        masks: MaskKind::ALL.to_vec(),
+        noise: 20.0,
+        noisy: 0.5,
+        holes: 0.1,
+        saturated: 0.2,
+        mask_errors: 0.2,
+    }
+}
+
 /// Solves of three iterations, of which a step does all, or two, so that they go on from step to step and over a checkpoint.
 #[test]
 fn an_unfolding_network_learns_from_solves_in_progress_and_resumes() {
@@ -110,19 +125,8 @@ fn an_unfolding_network_learns_from_solves_in_progress_and_resumes() {
         let network = NetworkConfig::Unfolding { channels: 1, iterations, widths: [16, 16, 16], depth: 1 };
         let mut config = config(network, 1, 30);
         config.noise = None;
-        config.snapshots = Some(SnapshotsConfig {
-            frames: [2, 4],
-            density: [0.3, 0.7],
-            masks: MaskKind::ALL.to_vec(),
-            noise: 20.0,
-            noisy: 0.5,
-            holes: 0.1,
-            saturated: 0.2,
-            mask_errors: 0.2,
-            start_iterations: 2,
-            iterations: 3,
-            at_once,
-        });
+        config.camera = Some(camera());
+        config.snapshots = Some(SnapshotsConfig { start_iterations: 2, iterations: 3, at_once });
         let mut straight = trainer(&config);
         let before = straight.validate().unwrap();
         let reports = run(&mut straight, 30);
@@ -143,16 +147,9 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.noise = None;
     config.data.frames = 1;
     config.data.batch = 1;
-    config.iterates = Some(IteratesConfig {
-        sigmas: vec![50.0, 25.0, 12.0],
-        calls: 2,
-        unrolled: false,
-        start_iterations: 2,
-        frames: [2, 4],
-        density: [0.3, 0.7],
-        gray_masks: 0.5,
-        holes: 0.1,
-    });
+    config.iterates =
+        Some(IteratesConfig { sigmas: vec![50.0, 25.0, 12.0], calls: 2, unrolled: false, start_iterations: 2 });
+    config.camera = Some(camera());
     config
 }
 
@@ -277,16 +274,17 @@ fn noise_or_iterates_but_not_both() {
     };
     assert!(good.validate().is_ok());
     assert_eq!(key(|c| c.noise = Some(NoiseConfig { sigma: [0.0, 50.0] })), "noise");
-    assert_eq!(key(|c| c.iterates = None), "noise");
+    assert_eq!(key(|c| c.iterates = None), "camera");
+    assert_eq!(key(|c| c.camera = None), "camera");
     assert_eq!(key(|c| c.network = DDNET), "iterates");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().sigmas.clear()), "iterates.sigmas");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().start_iterations = 1001), "iterates.start_iterations");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().calls = 0), "iterates.calls");
     assert_eq!(key(|c| c.iterates.as_mut().unwrap().calls = 4), "iterates.calls");
-    assert_eq!(key(|c| c.iterates.as_mut().unwrap().frames = [1, 4]), "iterates.frames");
-    assert_eq!(key(|c| c.iterates.as_mut().unwrap().density = [0.5, 0.3]), "iterates.density");
-    assert_eq!(key(|c| c.iterates.as_mut().unwrap().gray_masks = f64::NAN), "iterates.gray_masks");
-    assert_eq!(key(|c| c.iterates.as_mut().unwrap().holes = 0.6), "iterates.holes");
+    assert_eq!(key(|c| c.camera.as_mut().unwrap().frames = [0, 4]), "camera.frames");
+    assert_eq!(key(|c| c.camera.as_mut().unwrap().density = [0.5, 0.3]), "camera.density");
+    assert_eq!(key(|c| c.camera.as_mut().unwrap().masks.clear()), "camera.masks");
+    assert_eq!(key(|c| c.camera.as_mut().unwrap().holes = 0.6), "camera.holes");
 }
 
 #[test]
@@ -349,7 +347,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
         (|c| c.weights = Some("bundled:ffdnet_gray".into()), "weights = null, not \"bundled:ffdnet_gray\""),
         (|c| c.network = NetworkConfig::Ffdnet { channels: 1, width: 9, depth: 3 }, "network.width = 8, not 9"),
         (|c| c.data.patch = 12, "data.patch = 16, not 12"),
-        (|c| c.iterates.as_mut().unwrap().holes = 0.2, "iterates.holes = 0.1, not 0.2"),
+        (|c| c.camera.as_mut().unwrap().holes = 0.2, "camera.holes = 0.1, not 0.2"),
         (|c| c.training.steps = 10, "training.steps = 9, not 10"),
     ];
     for (change, needle) in changes {

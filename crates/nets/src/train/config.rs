@@ -3,7 +3,7 @@
 use crate::fastdvdnet::check_widths;
 use crate::kernels::Precision;
 use crate::video::Ends;
-use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, UnfoldingSpec};
+use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec, UnfoldingSpec};
 use candle_core::Tensor;
 use ndarray::Array4;
 use serde::{Deserialize, Serialize};
@@ -32,6 +32,8 @@ pub struct TrainConfig {
     /// The noise put on its input; this, `iterates` or `snapshots`.
     #[serde(default)]
     pub noise: Option<NoiseConfig>,
+    /// What measures the clips of `iterates` and `snapshots`.
+    pub camera: Option<CameraConfig>,
     /// The solver whose iterates are its input.
     #[serde(default)]
     pub iterates: Option<IteratesConfig>,
@@ -80,6 +82,15 @@ pub enum NetworkConfig {
         #[serde(default)]
         ends: Ends,
     },
+    /// [`Shiftnet`](crate::Shiftnet).
+    Shiftnet {
+        /// 1 gray, 3 RGB.
+        channels: usize,
+        /// Channels at a half, a quarter and an eighth of the size, multiples of 16 up to 512.
+        widths: [usize; 3],
+        /// Residual blocks at an eighth of the size, 1 to 16.
+        depth: usize,
+    },
     /// [`UnfoldingNet`](crate::UnfoldingNet).
     Unfolding {
         /// 1 gray, 3 RGB.
@@ -97,9 +108,10 @@ impl NetworkConfig {
     /// Colors of a frame: 1 or 3.
     pub fn channels(&self) -> usize {
         match *self {
-            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } | Self::Unfolding { channels, .. } => {
-                channels
-            }
+            Self::Ffdnet { channels, .. }
+            | Self::Fastdvdnet { channels, .. }
+            | Self::Shiftnet { channels, .. }
+            | Self::Unfolding { channels, .. } => channels,
             Self::Ddnet { .. } => 3,
         }
     }
@@ -110,6 +122,7 @@ impl NetworkConfig {
             Self::Ffdnet { channels, width, depth } => Self::ffdnet(channels, width, depth).validate().map(drop),
             Self::Fastdvdnet { channels, widths, .. } => Self::fastdvdnet(channels, widths).block().map(drop),
             Self::Ddnet { widths, .. } => check_widths(widths),
+            Self::Shiftnet { channels, widths, depth } => ShiftnetSpec { channels, widths, depth }.validate().map(drop),
             Self::Unfolding { channels, iterations, widths, depth } => {
                 Self::unfolding(channels, iterations, widths, depth).validate().map(drop)
             }
@@ -227,17 +240,6 @@ pub struct IteratesConfig {
     /// next. Default false: calls drawn at random, each by itself.
     #[serde(default)]
     pub unrolled: bool,
-    /// Frames of a measurement, the fewest and the most, drawn for each clip; 2 to 64.
-    pub frames: [usize; 2],
-    /// Share of open pixels of binary masks, the least and the most; in (0, 1].
-    pub density: [f64; 2],
-    /// Share of the clips whose masks have any transmittance. Default 0.
-    #[serde(default)]
-    pub gray_masks: f64,
-    /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. A network that has seen
-    /// holes stands pixels that are held out or defective. Default 0.
-    #[serde(default)]
-    pub holes: f64,
 }
 
 /// Training of an unfolding network: each clip is measured by a new simulated camera, and the loss is that of the result of every
@@ -245,26 +247,6 @@ pub struct IteratesConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SnapshotsConfig {
-    /// Frames of a measurement, the fewest and the most, drawn for each clip; 1 to 64.
-    pub frames: [usize; 2],
-    /// Share of open pixels of random, shifting and blocky masks, the least and the most; in (0, 1].
-    pub density: [f64; 2],
-    /// Kinds of masks, one drawn for each clip; a kind that is named twice comes twice as often.
-    pub masks: Vec<MaskKind>,
-    /// Largest σ of the noise of y in 0..255 units, white and shot noise in any proportion.
-    pub noise: f32,
-    /// Share of the clips that have such noise; the others have nearly none. Default 0.5.
-    #[serde(default = "half")]
-    pub noisy: f64,
-    /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. Default 0.
-    #[serde(default)]
-    pub holes: f64,
-    /// Share of the clips whose brightest pixels are clipped. Default 0.
-    #[serde(default)]
-    pub saturated: f64,
-    /// Share of the clips whose masks are told with errors of up to 0.3 pixels, 3 % of gain and a pedestal of 1 %. Default 0.
-    #[serde(default)]
-    pub mask_errors: f64,
     /// Iterations of TV that a solve starts from, 0 to 1000; 0 is y / Σ C. A solve with the network has to start alike. Default 0.
     #[serde(default)]
     pub start_iterations: usize,
@@ -273,6 +255,35 @@ pub struct SnapshotsConfig {
     /// Iterations that one step does and learns from; the solve goes on from there in a later step. 1 to `iterations`: then each step does
     /// whole solves.
     pub at_once: usize,
+}
+
+/// The simulated camera that measures each clip, drawn anew for each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// Frames of a measurement, the fewest and the most, drawn for each clip; 1 to 64.
+    pub frames: [usize; 2],
+    /// Share of open pixels of random, shifting and blocky masks, the least and the most; in (0, 1].
+    pub density: [f64; 2],
+    /// Kinds of masks, one drawn for each clip; a kind that is named twice comes twice as often. Default random.
+    #[serde(default = "random_masks")]
+    pub masks: Vec<MaskKind>,
+    /// Largest σ of the noise of y in 0..255 units, white and shot noise in any proportion. Default 0.
+    #[serde(default)]
+    pub noise: f32,
+    /// Share of the clips that have such noise; the others have nearly none. Default 0.5.
+    #[serde(default = "half")]
+    pub noisy: f64,
+    /// Share of the sensor's pixels that are not measured, at most; drawn for each clip from 0 to this, 0 to 0.5. A network that has seen
+    /// holes stands pixels that are held out or defective. Default 0.
+    #[serde(default)]
+    pub holes: f64,
+    /// Share of the clips whose brightest pixels are clipped. Default 0.
+    #[serde(default)]
+    pub saturated: f64,
+    /// Share of the clips whose masks are told with errors of up to 0.3 pixels, 3 % of gain and a pedestal of 1 %. Default 0.
+    #[serde(default)]
+    pub mask_errors: f64,
 }
 
 /// How masks look.
@@ -384,6 +395,9 @@ fn two() -> usize {
 fn average() -> f64 {
     0.999
 }
+fn random_masks() -> Vec<MaskKind> {
+    vec![MaskKind::Random]
+}
 fn hundred() -> u32 {
     100
 }
@@ -413,6 +427,10 @@ impl TrainConfig {
         let unfolds = matches!(self.network, NetworkConfig::Unfolding { .. });
         let legal = "[snapshots] for an unfolding network, and for no other";
         check(unfolds == self.snapshots.is_some(), "snapshots", "left out, or of another network", legal)?;
+        let measured = self.iterates.is_some() || self.snapshots.is_some();
+        let legal = "with [iterates] or [snapshots], and only then";
+        check(measured == self.camera.is_some(), "camera", "left out, or not needed", legal)?;
+        self.camera.iter().try_for_each(|camera| self.validate_camera(camera))?;
         match (&self.noise, &self.iterates, &self.snapshots) {
             (Some(NoiseConfig { sigma: [low, high] }), None, None) => {
                 let ordered = level(*low) && level(*high) && low <= high;
@@ -439,19 +457,26 @@ impl TrainConfig {
         check(self.checkpoint.every >= 1, "checkpoint.every", self.checkpoint.every, "at least 1")
     }
 
+    fn validate_camera(&self, camera: &CameraConfig) -> Result<()> {
+        let CameraConfig { frames: [few, many], density: [thin, dense], masks, noise, .. } = camera;
+        let CameraConfig { noisy, holes, saturated, mask_errors, .. } = camera;
+        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: camera.frames says how many")?;
+        let frames = (1..=64).contains(few) && (*few..=64).contains(many);
+        check(frames, "camera.frames", format_args!("[{few}, {many}]"), "two numbers from 1 to 64, the lower first")?;
+        let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
+        let legal = "two shares above 0 and at most 1, the lower first";
+        check(density, "camera.density", format_args!("[{thin}, {dense}]"), legal)?;
+        check(!masks.is_empty(), "camera.masks", "none", "at least one kind")?;
+        check(level(*noise), "camera.noise", noise, LEVELS)?;
+        check((0.0..=0.5).contains(holes), "camera.holes", holes, "0 to 0.5")?;
+        check((0.0..=1.0).contains(saturated), "camera.saturated", saturated, "0 to 1")?;
+        check((0.0..=1.0).contains(mask_errors), "camera.mask_errors", mask_errors, "0 to 1")?;
+        check((0.0..=1.0).contains(noisy), "camera.noisy", noisy, "0 to 1")
+    }
+
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig {
-            sigmas,
-            start_iterations,
-            calls,
-            frames: [few, many],
-            density: [thin, dense],
-            gray_masks,
-            holes,
-            unrolled: _,
-        } = iterates;
+        let IteratesConfig { sigmas, start_iterations, calls, unrolled: _ } = iterates;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
-        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: iterates.frames says how many")?;
         check(
             !sigmas.is_empty() && sigmas.iter().all(|&s| level(s)),
             "iterates.sigmas",
@@ -460,38 +485,12 @@ impl TrainConfig {
         )?;
         check(*start_iterations <= 1000, "iterates.start_iterations", start_iterations, "0 to 1000")?;
         let legal = "1 to the number of iterates.sigmas";
-        check((1..=sigmas.len()).contains(calls), "iterates.calls", calls, legal)?;
-        let frames = (2..=64).contains(few) && (*few..=64).contains(many);
-        check(frames, "iterates.frames", format_args!("[{few}, {many}]"), "two numbers from 2 to 64, the lower first")?;
-        let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
-        let legal = "two shares above 0 and at most 1, the lower first";
-        check(density, "iterates.density", format_args!("[{thin}, {dense}]"), legal)?;
-        check((0.0..=0.5).contains(holes), "iterates.holes", holes, "0 to 0.5")?;
-        check((0.0..=1.0).contains(gray_masks), "iterates.gray_masks", gray_masks, "0 to 1")
+        check((1..=sigmas.len()).contains(calls), "iterates.calls", calls, legal)
     }
 
     fn validate_snapshots(&self, snapshots: &SnapshotsConfig) -> Result<()> {
-        let SnapshotsConfig { frames: [few, many], density: [thin, dense], .. } = snapshots;
-        let SnapshotsConfig { masks, noise, noisy, holes, saturated, mask_errors, .. } = snapshots;
-        let SnapshotsConfig { start_iterations, iterations, at_once, .. } = snapshots;
-        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: snapshots.frames says how many")?;
+        let SnapshotsConfig { start_iterations, iterations, at_once } = snapshots;
         check(self.data.patch.is_multiple_of(8), "data.patch", self.data.patch, "a multiple of 8")?;
-        let frames = (1..=64).contains(few) && (*few..=64).contains(many);
-        check(
-            frames,
-            "snapshots.frames",
-            format_args!("[{few}, {many}]"),
-            "two numbers from 1 to 64, the lower first",
-        )?;
-        let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;
-        let legal = "two shares above 0 and at most 1, the lower first";
-        check(density, "snapshots.density", format_args!("[{thin}, {dense}]"), legal)?;
-        check(!masks.is_empty(), "snapshots.masks", "none", "at least one kind")?;
-        check(level(*noise), "snapshots.noise", noise, LEVELS)?;
-        check((0.0..=0.5).contains(holes), "snapshots.holes", holes, "0 to 0.5")?;
-        check((0.0..=1.0).contains(saturated), "snapshots.saturated", saturated, "0 to 1")?;
-        check((0.0..=1.0).contains(mask_errors), "snapshots.mask_errors", mask_errors, "0 to 1")?;
-        check((0.0..=1.0).contains(noisy), "snapshots.noisy", noisy, "0 to 1")?;
         check((1..=64).contains(iterations), "snapshots.iterations", iterations, "1 to 64")?;
         let legal = "1 to snapshots.iterations";
         check((1..=*iterations).contains(at_once), "snapshots.at_once", at_once, legal)?;

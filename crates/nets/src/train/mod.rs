@@ -3,6 +3,7 @@
 //! [`Trainer`] owns one run; the caller loops over [`Trainer::step`], validates and saves when it likes.
 
 mod adam;
+mod camera;
 mod centre;
 mod checkpoint;
 mod config;
@@ -18,7 +19,7 @@ mod step;
 pub use crate::kernels::Precision;
 pub use adam::Adam;
 pub use config::{
-    CheckpointConfig, DataConfig, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig, Optimizer,
+    CameraConfig, CheckpointConfig, DataConfig, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig, Optimizer,
     SnapshotsConfig, TrainConfig, TrainingConfig, ValidationConfig,
 };
 pub use data::{Frame, TrainData, frame_from_rgb};

@@ -1,22 +1,23 @@
 //! The training loop's body.
 
 use super::adam::Adam;
+use super::camera;
 use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
 use super::config::{
-    IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, SnapshotsConfig, TrainConfig, TrainingConfig,
+    CameraConfig, IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, SnapshotsConfig, TrainConfig, TrainingConfig,
 };
 use super::data::{TrainData, to_video};
-use super::iterates::Simulated;
 use super::noise::{add_noise, sensor};
 use super::pool::Pool;
 use super::revive::{Idle, State};
 use super::snapshots::{Exercise, cut};
 use crate::layers::Conv;
-use crate::unfolding::{MULTIPLE, UnfoldingNet};
+use crate::shift_unet::MULTIPLE;
+use crate::unfolding::UnfoldingNet;
 use crate::unrolled::{Gradients, RecordedCall, tensor};
 use crate::weights::{Storage, write_safetensors};
-use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result};
+use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result, Shiftnet, ShiftnetSpec};
 use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
@@ -24,6 +25,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use sci_forward::metrics::psnr;
+use sci_forward::{CfaPattern, Measurement};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -66,6 +68,7 @@ enum Model {
     Ffdnet(Ffdnet),
     Fastdvdnet(Fastdvdnet),
     Ddnet(Ddnet),
+    Shiftnet(Shiftnet),
     Unfolding(UnfoldingNet),
 }
 
@@ -81,6 +84,9 @@ impl Model {
             NetworkConfig::Ddnet { widths, ends } => {
                 Self::Ddnet(Ddnet::random(NetworkConfig::ddnet(widths), ends, seed)?)
             }
+            NetworkConfig::Shiftnet { channels, widths, depth } => {
+                Self::Shiftnet(Shiftnet::random(ShiftnetSpec { channels, widths, depth }, seed)?)
+            }
             NetworkConfig::Unfolding { channels, iterations, widths, depth } => {
                 let spec = NetworkConfig::unfolding(channels, iterations, widths, depth);
                 Self::Unfolding(UnfoldingNet::random(spec, seed)?)
@@ -93,6 +99,7 @@ impl Model {
             Self::Ffdnet(net) => net,
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
+            Self::Shiftnet(net) => net,
             Self::Unfolding(net) => net,
         }
     }
@@ -102,6 +109,7 @@ impl Model {
             Self::Ffdnet(net) => net,
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
+            Self::Shiftnet(net) => net,
             Self::Unfolding(net) => net,
         }
     }
@@ -112,6 +120,7 @@ impl Model {
             Self::Ffdnet(net) => Ok(net),
             Self::Fastdvdnet(net) => Ok(net),
             Self::Ddnet(net) => Ok(net),
+            Self::Shiftnet(net) => Ok(net),
             Self::Unfolding(net) => Err(takes_no_frames(net)),
         }
     }
@@ -153,7 +162,7 @@ enum Lesson {
     /// Noisy clips, or one iterate of a solver.
     Batch(Batch),
     /// Consecutive calls of a solver, and the truth.
-    Unrolled { simulated: Box<Simulated>, clean: Array4<f32>, calls: Vec<RecordedCall> },
+    Unrolled { measurement: Box<Measurement>, clean: Array4<f32>, calls: Vec<RecordedCall> },
     /// Some iterations of the solve of a measurement.
     Exercise(Box<Exercise>),
 }
@@ -228,6 +237,7 @@ impl Denoiser for Model {
             Self::Ffdnet(net) => net.denoise(call, noisy, out),
             Self::Fastdvdnet(net) => net.denoise(call, noisy, out),
             Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
+            Self::Shiftnet(net) => net.denoise(call, noisy, out),
             Self::Unfolding(net) => Err(Box::new(takes_no_frames(net))),
         }
     }
@@ -347,17 +357,16 @@ impl Trainer {
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
         let clip = |seed: u64| {
             let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
-            let [few, many] = settings.frames;
+            let [few, many] = self.camera().frames;
             let frames = rng.random_range(few..=many);
             let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
-            let simulated = Simulated::random(clip.view(), settings, &mut rng)?;
-            let mut model = model.clone();
+            let pattern = CfaPattern::ALL[rng.random_range(0..4)];
+            let measurement = camera::measure(clip.view(), pattern, self.camera(), &mut rng)?;
+            let calls = settings.record(&measurement, &mut model.clone(), &mut rng)?;
             if settings.unrolled {
-                let calls = simulated.last_calls(settings, &mut model, &mut rng)?;
-                return Ok(vec![Lesson::Unrolled { simulated: Box::new(simulated), clean: clip, calls }]);
+                return Ok(vec![Lesson::Unrolled { measurement: Box::new(measurement), clean: clip, calls }]);
             }
             let clean = stack(&[clip])?;
-            let calls = simulated.iterates(settings, &mut model, &mut rng)?;
             let lesson = |RecordedCall { input, sigma, .. }| {
                 Ok(Lesson::Batch(Batch { clean: clean.clone(), seen: tensor(input)?, sigmas: vec![sigma] }))
             };
@@ -367,13 +376,19 @@ impl Trainer {
         Ok(clips.into_iter().flatten().collect())
     }
 
+    fn camera(&self) -> &CameraConfig {
+        self.config.camera.as_ref().expect("validated: iterates and snapshots have a camera")
+    }
+
     /// A clip measured by a simulated camera.
     fn exercise(&self, settings: &SnapshotsConfig, seed: u64) -> Result<Exercise> {
         let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
-        let [few, many] = settings.frames;
+        let [few, many] = self.camera().frames;
         let frames = rng.random_range(few..=many);
         let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
-        Ok(Exercise { seed, ..Exercise::new(clip.view(), settings, &mut rng)? })
+        let measurement = camera::measure(clip.view(), CfaPattern::Rggb, self.camera(), &mut rng)?;
+        let exercise = Exercise::new(clip.view(), &measurement, settings.start_iterations)?;
+        Ok(Exercise { seed, end: settings.iterations, ..exercise })
     }
 
     /// Solves to go on with, each a lesson of its own as clips differ in length.
@@ -509,10 +524,10 @@ impl Trainer {
     fn gradient(&self, lesson: &mut Lesson) -> Result<Gradients> {
         let loss = self.config.training.loss;
         match lesson {
-            Lesson::Unrolled { simulated, clean, calls } => {
+            Lesson::Unrolled { measurement, clean, calls } => {
                 let of_clean = |v: ArrayView4<'_, f32>| Ok(loss.with_slope(&v - &*clean));
                 let recipe = self.config.iterates.as_ref().expect("these lessons come of iterates").recipe();
-                recipe.gradient(simulated.measurement(), calls, self.model.network()?, &self.vars, &of_clean)
+                recipe.gradient(measurement, calls, self.model.network()?, &self.vars, &of_clean)
             }
             Lesson::Exercise(exercise) => exercise.advance(self.model.unfolding()?, self.at_once(), &self.vars, loss),
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
@@ -564,7 +579,10 @@ impl Trainer {
     pub fn validate(&self) -> Result<Vec<Score>> {
         let mut model = self.frozen(self.weights()?);
         if let Some(iterates) = &self.config.iterates {
-            return Ok(vec![self.score_reconstruction(&mut model, iterates)?]);
+            return NOISE_LEVELS
+                .into_iter()
+                .map(|sigma| self.score_reconstruction(&mut model, iterates, sigma))
+                .collect();
         }
         if let Model::Unfolding(net) = &model {
             return NOISE_LEVELS.into_iter().map(|sigma| self.score_solves(net, sigma)).collect();
@@ -588,20 +606,22 @@ impl Trainer {
         Ok(scores)
     }
 
-    /// PSNR of the middle of each held-out clip, its first frames measured through the same random masks every time.
-    fn score_reconstruction(&self, model: &mut Model, settings: &IteratesConfig) -> Result<Score> {
+    /// PSNR of the middle of each held-out clip, its first frames measured through the same random masks every time, without noise or with that
+    /// of a level in 0..255 units.
+    fn score_reconstruction(&self, model: &mut Model, settings: &IteratesConfig, sigma: Option<f32>) -> Result<Score> {
         let (mut sum, mut count) = (0.0, 0);
         for (i, clip) in self.data.validation.iter().enumerate() {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
-            let simulated = Simulated::random(clean.view(), settings, &mut rng)?;
-            let restored = settings.recipe().solve(simulated.measurement(), model)?;
+            let pattern = CfaPattern::ALL[i % 4];
+            let measurement = camera::plain(clean.view(), pattern, sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
+            let restored = settings.recipe().solve(&measurement, model)?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;
             }
         }
-        Ok(Score { sigma: None, psnr_db: sum / f64::from(count) })
+        Ok(Score { sigma, psnr_db: sum / f64::from(count) })
     }
 
     /// PSNR of the solves of the middle of each held-out clip, without noise on the measurement or with that of a level in 0..255 units.
@@ -612,7 +632,8 @@ impl Trainer {
         for (i, clip) in self.data.validation.iter().enumerate() {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = cut(&centre(&to_video(clip, VALIDATION_FRAMES)), MULTIPLE);
-            let exercise = Exercise::plain(clean.view(), sigma.unwrap_or(0.0) / 255.0, start_iterations, &mut rng)?;
+            let measurement = camera::plain(clean.view(), CfaPattern::Rggb, sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
+            let exercise = Exercise::new(clean.view(), &measurement, start_iterations)?;
             let (results, _) = exercise.unfold(net, iterations)?;
             let errors = results.last().map(|last| exercise.errors(last)).transpose()?.unwrap_or_default();
             psnrs.extend(errors.into_iter().map(|error| -10.0 * f64::from(error).log10()));

@@ -6,49 +6,34 @@
 //! v_k, h_k = network_k(x_k, x_k − v_{k−1}, h_{k−1};  y / Σ C, C_t, Σ C),      x_{k+1} = v_k + Hᵀ (y − H v_k) / Σ_t C_t²
 //! ```
 //!
-//! Everything is at half the size, each 2×2 pixels as channels (the *phases* of an image); the network adds to its estimate, and
-//! begins silent, so that the untrained solve is plain projection. Features `h` go from each iteration to the next. Frames are
-//! mixed at no cost: in each residual block a share of the channels is taken from the frame before, and as much from the frame after
-//! (zeros beyond the ends), so that any number of frames goes through. Color frames leave the network as RGB, though it is shown the mosaic
+//! The network is a [`UnetSpec`] body; it adds to its estimate, and begins silent, so that the untrained solve is plain projection.
+//! Features `h` go from each iteration to the next. Color frames leave the network as RGB, though it is shown the mosaic
 //! alone: there is no demosaicing beside it.
 //!
 //! # References
-//! Zhang, Ghanem, *ISTA-Net*, CVPR 2018, and Meng, Jalali, Yuan, *GAP-net for snapshot compressive imaging*, 2020 (unfolding); Zhang, Zuo, Zhang,
-//! *FFDNet*, TIP 2018 (half size by pixels as channels); Lin, Gan, Han, *TSM: temporal shift module*, ICCV 2019; Qi et al., *Real-time
-//! streaming video denoising with bidirectional buffers*, ACM MM 2022 (the shift in video restoration).
+//! Zhang, Ghanem, *ISTA-Net*, CVPR 2018, and Meng, Jalali, Yuan, *GAP-net for snapshot compressive imaging*, 2020 (unfolding).
 
 mod snapshot;
-mod temporal_shift;
 #[cfg(test)]
 mod tests;
 
 use snapshot::Shown;
 pub(crate) use snapshot::{Progress, Snapshot, phases};
-use temporal_shift::TemporalShift;
 
-use crate::infer::{Cache, Engine, channel_row, set_channel};
-use crate::kernels::{Blocked, Conv3x3, LANES};
-use crate::layers::{Conv, Shift, Source, chain};
+use crate::infer::{Cache, channel_row, set_channel};
+use crate::kernels::Blocked;
+use crate::layers::{Conv, Source};
 use crate::network::{Layers, reflect};
+use crate::shift_unet::{self, MULTIPLE, PHASES, UnetSpec};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
 use admm::{Call, Estimate, Prior, PriorError};
 use candle_core::Tensor;
-use candle_nn::ops::pixel_shuffle;
 use ndarray::{Array2, Array4, ArrayView2, ArrayView3, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 use sci_forward::CfaPattern;
 
-/// Sizes at which the U-shaped network works: a half, a quarter and an eighth.
-const LEVELS: usize = 3;
-/// Sides of an image are continued to a multiple of this.
-pub(crate) const MULTIPLE: usize = 2 << (LEVELS - 1);
-/// One of so many channels is taken from the frame before, and one from the frame after.
-const SHIFTED: usize = 4;
-/// Phases of an image of one channel.
-const PHASES: usize = 4;
 /// Images beside the estimate that the network is shown: what the projection changed, y / Σ C, the mask, Σ C, and y / Σ C behind the mask.
 const BESIDE: usize = 5;
 /// Where an RGGB sensor samples the phases `[3 · 4]` of an RGB frame.
@@ -62,89 +47,37 @@ pub struct UnfoldingSpec {
     /// Iterations with weights of their own, 1 to 32; all further ones have those of the last.
     pub iterations: usize,
     /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
-    pub widths: [usize; LEVELS],
+    pub widths: [usize; 3],
     /// Residual blocks at an eighth of the size; there are two at the other sizes. 1 to 16.
     pub depth: usize,
 }
 
 impl UnfoldingSpec {
     pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
-        let outputs = |name: &str| file.shape(&format!("iteration0.{name}.weight"))?.first().copied();
-        let channels = outputs("output")? / PHASES;
-        let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
+        let (outputs, widths, depth) = UnetSpec::recognise(file, "iteration0.")?;
         let iterations = (0..).take_while(|k| file.shape(&format!("iteration{k}.input.weight")).is_some()).count();
-        let blocks = (0..).take_while(|b| file.shape(&format!("iteration0.block{b}.0.weight")).is_some()).count();
-        Some(Self { channels, iterations, widths, depth: blocks.checked_sub(2 * (LEVELS - 1))? })
+        Some(Self { channels: outputs / PHASES, iterations, widths, depth })
     }
 
     pub(crate) fn validate(self) -> Result<Self> {
         let bad =
             |key, value: usize, legal: &str| Err(Error::Setting { key, value: value.to_string(), legal: legal.into() });
-        let width = |w: &usize| !(16..=512).contains(w) || !w.is_multiple_of(16);
         match self {
             Self { channels, .. } if channels != 1 && channels != 3 => bad("channels", channels, "1 (gray) or 3 (RGB)"),
             Self { iterations, .. } if !(1..=32).contains(&iterations) => bad("iterations", iterations, "1 to 32"),
-            Self { depth, .. } if !(1..=16).contains(&depth) => bad("depth", depth, "1 to 16"),
-            Self { widths, .. } => match widths.into_iter().find(width) {
-                Some(wrong) => bad("widths", wrong, "multiples of 16 from 16 to 512"),
-                None => Ok(self),
-            },
+            spec => spec.body().validate().map(|()| spec),
         }
     }
 
-    /// What is done between the first and the last convolution of an iteration.
-    fn steps(self) -> Vec<Step> {
-        let down = (0..LEVELS - 1).flat_map(|level| [Step::Block(level), Step::Down(level)]);
-        let deepest = std::iter::repeat_n(Step::Block(LEVELS - 1), self.depth);
-        let up = (0..LEVELS - 1).rev().flat_map(|level| [Step::Up(level), Step::Block(level)]);
-        down.chain(deepest).chain(up).collect()
-    }
-
-    /// Channels that the network is shown, and those that it finds.
-    fn ends(self) -> (usize, usize) {
-        (PHASES * (self.channels + BESIDE), PHASES * self.channels)
-    }
-
-    /// Name, channels, stride, ReLU, bias and silence of the layers of an iteration, in the order in which they are done.
-    fn layers(self) -> Vec<LayerSpec> {
-        let (w, (shown, found)) = (self.widths, self.ends());
-        let plain = |name: &str, inputs, outputs| LayerSpec::new(name.to_owned(), inputs, outputs);
-        let mut layers = vec![plain("input", shown, w[0])];
-        let mut blocks = 0;
-        for step in self.steps() {
-            match step {
-                Step::Block(level) => {
-                    let name = |i: usize| format!("block{blocks}.{i}");
-                    layers.push(LayerSpec { relu: true, ..LayerSpec::new(name(0), w[level], w[level]) });
-                    layers.push(LayerSpec { silent: true, ..LayerSpec::new(name(1), w[level], w[level]) });
-                    blocks += 1;
-                }
-                Step::Down(level) => {
-                    let down = plain(&format!("down{level}"), w[level], w[level + 1]);
-                    layers.push(LayerSpec { stride: 2, relu: true, ..down });
-                }
-                Step::Up(level) => {
-                    let up = plain(&format!("up{level}"), w[level + 1], PHASES * w[level]);
-                    layers.push(LayerSpec { silent: true, bias: false, ..up });
-                }
-            }
-        }
-        layers.push(LayerSpec { silent: true, ..plain("output", w[0], found) });
-        layers
+    /// What is done in an iteration.
+    fn body(self) -> UnetSpec {
+        let ends = (PHASES * (self.channels + BESIDE), PHASES * self.channels);
+        UnetSpec { ends, widths: self.widths, depth: self.depth }
     }
 
     /// Multiply-adds for each pixel of each frame, over all iterations.
     pub fn multiply_adds(self) -> f64 {
-        let mut pixels = 1.0 / PHASES as f64;
-        let mut sum = 0.0;
-        for layer in self.layers() {
-            pixels /= (layer.stride * layer.stride) as f64;
-            sum += pixels * (9 * layer.inputs * layer.outputs) as f64;
-            if layer.name.starts_with("up") {
-                pixels *= PHASES as f64;
-            }
-        }
-        sum * self.iterations as f64
+        self.body().multiply_adds() * self.iterations as f64
     }
 }
 
@@ -153,35 +86,6 @@ impl std::fmt::Display for UnfoldingSpec {
         let colors = if self.channels == 1 { "gray" } else { "color" };
         let ([a, b, c], n) = (self.widths, self.iterations);
         write!(f, "unfolding network ({colors}, {n} iterations, {a}/{b}/{c} channels, depth {})", self.depth)
-    }
-}
-
-/// A part of an iteration; its level is 0 at half the size.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
-    /// Residual block: `h + conv(relu(conv(shift(h))))`.
-    Block(usize),
-    /// To the next level.
-    Down(usize),
-    /// Back from it, added to what was there.
-    Up(usize),
-}
-
-/// A convolution.
-struct LayerSpec {
-    name: String,
-    inputs: usize,
-    outputs: usize,
-    stride: usize,
-    relu: bool,
-    bias: bool,
-    /// It begins as zero: what it is added to is right already.
-    silent: bool,
-}
-
-impl LayerSpec {
-    fn new(name: String, inputs: usize, outputs: usize) -> Self {
-        Self { name, inputs, outputs, stride: 1, relu: false, bias: true, silent: false }
     }
 }
 
@@ -221,25 +125,24 @@ impl UnfoldingNet {
     /// [`Error::Setting`] for a size out of range.
     pub fn random(spec: UnfoldingSpec, seed: u64) -> Result<Self> {
         let mut net = Self::build(spec.validate()?, &mut Source::Random(&mut ChaCha8Rng::seed_from_u64(seed)))?;
-        let layers = spec.layers();
-        for (conv, layer) in net.convs.iter_mut().zip(layers.iter().cycle()) {
-            if layer.silent {
-                conv.silence()?;
-            }
+        for k in 0..spec.iterations {
+            let layers = net.iteration(k);
+            spec.body().silence(&mut net.convs[layers])?;
         }
         Ok(net)
     }
 
     fn build(spec: UnfoldingSpec, source: &mut Source<'_>) -> Result<Self> {
-        let mut convs = Vec::new();
-        for k in 0..spec.iterations {
-            for LayerSpec { name, inputs, outputs, stride, relu, bias, .. } in spec.layers() {
-                let opts = Conv3x3 { stride, relu, ..Conv3x3::default() };
-                let shift = if bias { Shift::Bias } else { Shift::Nothing };
-                convs.push(Conv::new(source, format!("iteration{k}.{name}"), (inputs, outputs), opts, shift)?);
-            }
-        }
+        let iteration = |k| spec.body().build(source, &format!("iteration{k}."));
+        let convs = (0..spec.iterations).map(iteration).collect::<Result<Vec<_>>>()?.concat();
         Ok(Self { spec, convs, cache: Cache::default() })
+    }
+
+    /// The layers of an iteration; those after the last have its.
+    fn iteration(&self, k: usize) -> std::ops::Range<usize> {
+        let each = self.convs.len() / self.spec.iterations;
+        let first = each * k.min(self.spec.iterations - 1);
+        first..first + each
     }
 
     /// Its size.
@@ -269,7 +172,8 @@ impl UnfoldingNet {
             };
             let base = self.base(&x, before.as_ref())?;
             let shown = Tensor::cat(&[&(&base - f64::from(GRAY))?, &(&x - &sensor)?, &snapshot.beside], 1)?;
-            let (found, h) = self.iteration(k.min(self.spec.iterations - 1), &shown, features.take())?;
+            let (convs, frames) = (&self.convs[self.iteration(k)], shown.dim(0)?);
+            let (found, h) = self.spec.body().forward(convs, &shown, features.take(), frames)?;
             let v = (base + found)?;
             before = Some(v.clone());
             features = Some(h);
@@ -277,44 +181,6 @@ impl UnfoldingNet {
         }
         let features = features.ok_or_else(|| Error::Data("a solve of no iterations".to_owned()))?;
         Ok((results, features))
-    }
-
-    /// One call of the network: what it adds to the estimate, and the features for the next.
-    fn iteration(&self, k: usize, shown: &Tensor, features: Option<Tensor>) -> candle_core::Result<(Tensor, Tensor)> {
-        let each = self.convs.len() / self.spec.iterations;
-        let convs = &self.convs[k * each..][..each];
-        let mut next = 0;
-        let mut layers = |count: usize| {
-            next += count;
-            &convs[next - count..next]
-        };
-        let h = chain(layers(1), &[], shown)?;
-        let mut h = match features {
-            Some(features) => (features + h)?,
-            None => h,
-        };
-        let mut above = Vec::new();
-        for step in self.spec.steps() {
-            h = match step {
-                Step::Block(_) => {
-                    let shifted = h.apply_op1(TemporalShift::of(h.dim(1)?))?;
-                    (&h + chain(layers(2), &[], &shifted)?)?
-                }
-                Step::Down(_) => {
-                    let down = chain(layers(1), &[], &h)?;
-                    above.push(std::mem::replace(&mut h, down.clone()));
-                    down
-                }
-                Step::Up(_) => {
-                    let up = pixel_shuffle(&chain(layers(1), &[], &h)?, 2)?;
-                    match above.pop() {
-                        Some(above) => (above + up)?,
-                        None => up,
-                    }
-                }
-            };
-        }
-        Ok((chain(layers(1), &[], &h)?, h))
     }
 
     /// What the network adds to: the iterate, in color the last result with the iterate where the sensor samples it; at first
@@ -507,10 +373,9 @@ impl UnfoldingNet {
             let expected = solve.shown.masks.shape().to_vec();
             return Err(Error::Shape { what: "an iterate", expected, found: x.shape().to_vec() });
         }
-        let each = self.convs.len() / self.spec.iterations;
-        let first = each * solve.iteration.min(self.spec.iterations - 1);
-        let convs: Vec<&Conv> = self.convs.iter().collect();
-        let (shuffled, plain) = results(self.spec);
+        let layers = self.iteration(solve.iteration);
+        let (body, convs) = (self.spec.body(), self.convs.iter().collect::<Vec<_>>());
+        let (shuffled, plain) = body.results(self.spec.iterations);
         let engine = self.cache.engine(&convs, &shuffled, &plain)?;
         let [half_h, half_w] = solve.lattice.half();
         engine.start(half_h, half_w);
@@ -518,19 +383,19 @@ impl UnfoldingNet {
         let mut features = std::mem::take(&mut solve.features).into_iter();
         let mut h = Vec::with_capacity(x.len_of(Axis(0)));
         for t in 0..x.len_of(Axis(0)) {
-            let mut shown = engine.image(self.spec.ends().0, half_h, half_w);
+            let mut shown = engine.image(body.ends.0, half_h, half_w);
             show(&mut shown, solve, x, &base, t);
-            let mut begun = engine.conv(first, &shown)?;
+            let mut begun = engine.conv(layers.start, &shown)?;
             engine.recycle(shown);
             if let Some(before) = features.next() {
-                add(&mut begun, &before);
+                shift_unet::add(&mut begun, &before);
                 engine.recycle(before);
             }
             h.push(begun);
         }
-        let h = between(engine, &self.spec.steps(), first + 1, h)?;
+        let h = body.between(engine, layers.start, h)?;
         for (h, mut frame) in h.iter().zip(base.outer_iter_mut()) {
-            let found = engine.conv(first + each - 1, h)?;
+            let found = engine.conv(layers.end - 1, h)?;
             frame.outer_iter_mut().enumerate().for_each(|(c, plane)| solve.lattice.add(&found, PHASES * c, plane));
             engine.recycle(found);
         }
@@ -605,15 +470,6 @@ impl Prior for UnfoldingPrior {
     }
 }
 
-/// Which layers' results are shuffled, and which are held in f32: all but those inside residual blocks.
-fn results(spec: UnfoldingSpec) -> (Vec<usize>, Vec<usize>) {
-    let layers: Vec<LayerSpec> = (0..spec.iterations).flat_map(|_| spec.layers()).collect();
-    let which = |wanted: fn(&LayerSpec) -> bool| {
-        layers.iter().enumerate().filter(|(_, layer)| wanted(layer)).map(|(i, _)| i).collect()
-    };
-    (which(|layer| layer.name.starts_with("up")), which(|layer| !(layer.relu && layer.stride == 1)))
-}
-
 /// Writes what the network is shown of a frame.
 fn show(image: &mut Blocked, solve: &Unfolding, x: ArrayView3<'_, f32>, base: &Array4<f32>, t: usize) {
     let Unfolding { shown: Shown { mean, masks, open }, lattice, .. } = solve;
@@ -631,94 +487,4 @@ fn show(image: &mut Blocked, solve: &Unfolding, x: ArrayView3<'_, f32>, base: &A
     write(&|i, j| masks[[t, i, j]] - GRAY);
     write(&|i, j| open[[i, j]] - GRAY);
     write(&|i, j| (mean[[i, j]] - GRAY) * masks[[t, i, j]]);
-}
-
-/// All of an iteration but its first and last layer, from the layer `next` on, for the features of all frames.
-fn between(engine: &mut Engine, steps: &[Step], mut next: usize, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
-    let mut above: Vec<Vec<Blocked>> = Vec::new();
-    for step in steps {
-        match step {
-            Step::Block(_) => {
-                add_block(engine, next, &mut h)?;
-                next += 2;
-            }
-            Step::Down(_) => {
-                let down = h.iter().map(|h| engine.conv(next, h)).collect::<Result<_>>()?;
-                above.push(std::mem::replace(&mut h, down));
-                next += 1;
-            }
-            Step::Up(_) => {
-                let mut sums = above.pop().unwrap_or_default();
-                for (h, sum) in h.drain(..).zip(&mut sums) {
-                    engine.add_shuffled(next, h, sum)?;
-                }
-                h = sums;
-                next += 1;
-            }
-        }
-    }
-    Ok(h)
-}
-
-/// The residual block of the layers `first` and the one after it, frame by frame.
-fn add_block(engine: &mut Engine, first: usize, h: &mut [Blocked]) -> Result<()> {
-    // The frame before, as it was before the block.
-    let mut before: Option<Blocked> = None;
-    for t in 0..h.len() {
-        let (channels, height, width) = h[t].shape();
-        let mut image = engine.image(channels, height, width);
-        shift(&mut image, before.as_ref(), &h[t], h.get(t + 1));
-        let inside = engine.conv(first, &image)?;
-        let found = engine.conv(first + 1, &inside)?;
-        engine.recycle(inside);
-        sum(&mut image, &h[t], &found);
-        engine.recycle(found);
-        let old = before.replace(std::mem::replace(&mut h[t], image));
-        old.into_iter().for_each(|old| engine.recycle(old));
-    }
-    before.into_iter().for_each(|old| engine.recycle(old));
-    Ok(())
-}
-
-/// [`TemporalShift`] of one frame.
-fn shift(image: &mut Blocked, before: Option<&Blocked>, now: &Blocked, after: Option<&Blocked>) {
-    let each_way = TemporalShift::of(now.shape().0).each_way;
-    for block in 0..image.blocks() {
-        let lanes = |from: usize| {
-            let [from, to] =
-                [from, from + each_way].map(|c| c.clamp(block * LANES, (block + 1) * LANES) - block * LANES);
-            from..to
-        };
-        let ways = [(lanes(0), before), (lanes(each_way), after)];
-        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
-            row.as_flattened_mut().copy_from_slice(now.row(block, y));
-            for (lanes, other) in ways.iter().filter(|(lanes, _)| !lanes.is_empty()) {
-                match other.map(|other| other.row(block, y).as_chunks::<LANES>().0) {
-                    Some(other) => row.iter_mut().zip(other).for_each(|(to, from)| {
-                        to[lanes.clone()].copy_from_slice(&from[lanes.clone()]);
-                    }),
-                    None => row.iter_mut().for_each(|to| to[lanes.clone()].fill(0.0)),
-                }
-            }
-        });
-    }
-}
-
-/// `image = a + b`.
-fn sum(image: &mut Blocked, a: &Blocked, b: &Blocked) {
-    for block in 0..image.blocks() {
-        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
-            let both = a.row(block, y).iter().zip(b.row(block, y));
-            row.as_flattened_mut().iter_mut().zip(both).for_each(|(sum, (a, b))| *sum = a + b);
-        });
-    }
-}
-
-/// `image += other`.
-fn add(image: &mut Blocked, other: &Blocked) {
-    for block in 0..image.blocks() {
-        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
-            row.as_flattened_mut().iter_mut().zip(other.row(block, y)).for_each(|(sum, value)| *sum += value);
-        });
-    }
 }

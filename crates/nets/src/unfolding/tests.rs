@@ -2,6 +2,7 @@
 
 use super::*;
 use candle_core::{DType, Device};
+use candle_nn::ops::pixel_shuffle;
 use ndarray::{Array3, Zip};
 use rand::RngExt;
 

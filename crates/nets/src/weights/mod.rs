@@ -8,8 +8,8 @@ mod pth;
 mod stored;
 
 use crate::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, UnfoldingNet,
-    UnfoldingSpec,
+    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, Shiftnet,
+    ShiftnetSpec, UnfoldingNet, UnfoldingSpec,
 };
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
@@ -29,6 +29,8 @@ pub enum Architecture {
     Fastdvdnet(FastdvdnetSpec),
     /// DDNet.
     Ddnet(DdnetSpec),
+    /// ShiftNet, gray or color.
+    Shiftnet(ShiftnetSpec),
     /// The unfolding network, gray or color.
     Unfolding(UnfoldingSpec),
 }
@@ -39,6 +41,7 @@ impl std::fmt::Display for Architecture {
             Self::Ffdnet(spec) => spec.fmt(f),
             Self::Fastdvdnet(spec) => spec.fmt(f),
             Self::Ddnet(spec) => spec.fmt(f),
+            Self::Shiftnet(spec) => spec.fmt(f),
             Self::Unfolding(spec) => spec.fmt(f),
         }
     }
@@ -128,6 +131,7 @@ impl WeightFile {
     pub fn architecture(&self) -> Result<Architecture> {
         UnfoldingSpec::recognise(self)
             .map(Architecture::Unfolding)
+            .or_else(|| ShiftnetSpec::recognise(self).map(Architecture::Shiftnet))
             .or_else(|| FastdvdnetSpec::recognise(self).map(Architecture::Fastdvdnet))
             .or_else(|| DdnetSpec::recognise(self).map(Architecture::Ddnet))
             .or_else(|| FfdnetSpec::recognise(self).map(Architecture::Ffdnet))
@@ -175,6 +179,7 @@ pub fn network(file: WeightFile) -> Result<Box<dyn Layers>> {
         Architecture::Ffdnet(_) => Box::new(Ffdnet::from_weights(file)?),
         Architecture::Fastdvdnet(_) => Box::new(Fastdvdnet::from_weights(file, Ends::Circular)?),
         Architecture::Ddnet(_) => Box::new(Ddnet::from_weights(file, Ends::Circular)?),
+        Architecture::Shiftnet(_) => Box::new(Shiftnet::from_weights(file)?),
         Architecture::Unfolding(_) => Box::new(UnfoldingNet::from_weights(file)?),
     })
 }

@@ -5,6 +5,7 @@ mod fastdvdnet;
 mod ffdnet;
 mod network;
 mod saving;
+mod shiftnet;
 mod tv;
 mod unfolding;
 mod wnnm;
@@ -27,7 +28,8 @@ pub use saving::{MultiplyAdds, Saving, Work};
 pub use tv::first_of_all;
 
 /// Every denoiser.
-const DENOISERS: &[Entry] = &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, unfolding::ENTRY];
+const DENOISERS: &[Entry] =
+    &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, shiftnet::ENTRY, unfolding::ENTRY];
 /// Those that are going to be.
 const NOT_YET: &[&str] = &["wavelet"];
 

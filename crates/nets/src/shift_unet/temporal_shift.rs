@@ -3,33 +3,35 @@
 use super::SHIFTED;
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor, WithDType};
 
-/// Of images `[T, C, H, W]`, in order of time: the first channels of each from the frame before, as many from the frame after, the others
-/// its own. Zeros beyond the ends.
+/// Of images `[N, C, H, W]`, clips of equal length one after another, each in order of time: the first channels of each from the frame before, as many from the frame after, the others
+/// its own. Zeros beyond the ends of a clip.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TemporalShift {
     pub(super) each_way: usize,
+    /// Of a clip.
+    frames: usize,
     /// The adjoint: from the frame after first.
     back: bool,
 }
 
 impl TemporalShift {
-    pub(super) fn of(channels: usize) -> Self {
-        Self { each_way: channels / SHIFTED, back: false }
+    pub(super) fn of(channels: usize, frames: usize) -> Self {
+        Self { each_way: channels / SHIFTED, frames, back: false }
     }
 
-    /// Which frame channel `c` of frame `t` of `frames` is taken from.
-    pub(super) fn source(self, t: usize, c: usize, frames: usize) -> Option<usize> {
+    /// Which image channel `c` of image `n` is taken from.
+    fn source(self, n: usize, c: usize) -> Option<usize> {
         match (c / self.each_way.max(1), self.back) {
-            (0, false) | (1, true) => t.checked_sub(1),
-            (1, false) | (0, true) => Some(t + 1).filter(|&after| after < frames),
-            _ => Some(t),
+            (0, false) | (1, true) => (!n.is_multiple_of(self.frames)).then(|| n - 1),
+            (1, false) | (0, true) => Some(n + 1).filter(|after| !after.is_multiple_of(self.frames)),
+            _ => Some(n),
         }
     }
 
-    fn shift<T: WithDType>(self, x: &[T], (frames, channels, plane): (usize, usize, usize)) -> Vec<T> {
+    fn shift<T: WithDType>(self, x: &[T], channels: usize, plane: usize) -> Vec<T> {
         let mut out = vec![T::zero(); x.len()];
         for (i, out) in out.chunks_exact_mut(plane).enumerate() {
-            if let Some(t) = self.source(i / channels, i % channels, frames) {
+            if let Some(t) = self.source(i / channels, i % channels) {
                 out.copy_from_slice(&x[(t * channels + i % channels) * plane..][..plane]);
             }
         }
@@ -43,14 +45,13 @@ impl CustomOp1 for TemporalShift {
     }
 
     fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
-        let (t, c, h, w) = layout.shape().dims4()?;
+        let (_, c, h, w) = layout.shape().dims4()?;
         let Some((from, to)) = layout.contiguous_offsets() else {
             return Err(candle_core::Error::RequiresContiguous { op: "temporal-shift" }.bt());
         };
-        let size = (t, c, h * w);
         let shifted = match x {
-            CpuStorage::F32(x) => CpuStorage::F32(self.shift(&x[from..to], size)),
-            CpuStorage::F64(x) => CpuStorage::F64(self.shift(&x[from..to], size)),
+            CpuStorage::F32(x) => CpuStorage::F32(self.shift(&x[from..to], c, h * w)),
+            CpuStorage::F64(x) => CpuStorage::F64(self.shift(&x[from..to], c, h * w)),
             _ => candle_core::bail!("temporal-shift: f32 and f64 only"),
         };
         Ok((shifted, layout.shape().clone()))

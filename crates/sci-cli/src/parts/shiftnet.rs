@@ -1,0 +1,30 @@
+//! `kind = "shiftnet"`.
+
+use anyhow::Context;
+
+use super::{Built, Entry, Inference, Part, Site};
+use crate::table::Table;
+
+pub(super) const ENTRY: Entry = Entry { kind: "shiftnet", read };
+
+#[derive(Debug)]
+struct Shiftnet(Inference);
+
+fn read(t: &mut Table<'_>) -> Box<dyn Part> {
+    Box::new(Shiftnet(Inference::read(t)))
+}
+
+impl Part for Shiftnet {
+    fn network(&self) -> Option<&Inference> {
+        Some(&self.0)
+    }
+
+    fn adapts(&self) -> bool {
+        true
+    }
+
+    fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {
+        let net = nets::Shiftnet::load(&self.0.weights).context("denoiser.weights")?;
+        self.0.build(net, site)
+    }
+}
