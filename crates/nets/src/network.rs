@@ -166,21 +166,6 @@ pub trait Network: Layers {
     /// [`Error::Sigma`].
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor, Error>;
 
-    /// Whether it makes use of how frames were measured ([`Network::forward_beside`]).
-    fn measured(&self) -> bool {
-        false
-    }
-
-    /// [`Network::forward`] of a network that is shown `beside` the frames how they were measured: `[N, 1 + C, H, W]`, the mask of each frame,
-    /// with a root mean square of √½ over all of them, and what the data step changed in it.
-    ///
-    /// # Errors
-    /// As [`Network::forward`].
-    fn forward_beside(&self, clips: &Tensor, noise: &[f32], beside: Option<&Tensor>) -> Result<Tensor, Error> {
-        debug_assert!(beside.is_none());
-        self.forward(clips, noise)
-    }
-
     /// [`Network::forward`] of one clip taken apart, so that its gradient can be had with the memory of one window:
     /// for each stage the windows, in the order of their outputs, for a clip of `frames` frames.
     ///

@@ -2,11 +2,8 @@
 //! mixed by shifts in time, told σ by a constant map.
 //!
 //! ```text
-//! out = x + shuffle(body([unshuffle(x) − ½, σ, unshuffle(C_t − ½), unshuffle(Δ)]))
+//! out = x + shuffle(body([unshuffle(x) − ½, σ]))
 //! ```
-//!
-//! The masks C_t and what the last data step changed, Δ = x − v, are shown to a *measured* ShiftNet alone, in solves that know them: they tell
-//! it where the iterate is a guess, and how far off the guesses are.
 //!
 //! # References
 //! Those of its body (`shift_unet`): Zhang, Zuo, Zhang, *FFDNet*, TIP 2018; Lin, Gan, Han, *TSM*, ICCV 2019; Qi et al., *Real-time streaming video
@@ -16,21 +13,18 @@ use crate::infer::{Cache, channel_row, set_channel};
 use crate::layers::{Conv, Source};
 use crate::network::{Layers, Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
 use crate::shift_unet::{MULTIPLE, PHASES, UnetSpec};
-use crate::unrolled::beside;
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
-use ndarray::{Array2, Array4, ArrayView2, ArrayView4, ArrayViewMut4, Axis, s};
+use ndarray::{ArrayView4, ArrayViewMut4, Axis, s};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
 
 /// The middle of the range of frames, which is taken off what the network is shown.
 const GRAY: f32 = 0.5;
-/// Changes are small beside frames: they are shown so many times as large.
-const CHANGE: f32 = 4.0;
 /// What the names of all tensors begin with.
 const PREFIX: &str = "body.";
 
@@ -43,15 +37,12 @@ pub struct ShiftnetSpec {
     pub widths: [usize; 3],
     /// Residual blocks at an eighth of the size; there are two at the other sizes. 1 to 16.
     pub depth: usize,
-    /// Whether it is shown how frames were measured.
-    pub measured: bool,
 }
 
 impl ShiftnetSpec {
     pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
         let (outputs, widths, depth) = UnetSpec::recognise(file, PREFIX)?;
-        let inputs = file.shape(&format!("{PREFIX}input.weight"))?.get(1)?;
-        Some(Self { channels: outputs / PHASES, widths, depth, measured: *inputs > outputs + 1 })
+        Some(Self { channels: outputs / PHASES, widths, depth })
     }
 
     pub(crate) fn validate(self) -> Result<Self> {
@@ -64,17 +55,7 @@ impl ShiftnetSpec {
 
     fn body(self) -> UnetSpec {
         let colors = PHASES * self.channels;
-        UnetSpec { ends: (colors + 1 + PHASES * self.beside(), colors), widths: self.widths, depth: self.depth }
-    }
-
-    /// What is taken off each image beside the frame, and how often it is shown.
-    fn shades(self) -> impl Iterator<Item = (f32, f32)> {
-        [(GRAY, 1.0)].into_iter().chain(std::iter::repeat((0.0, CHANGE))).take(self.beside())
-    }
-
-    /// Images beside those of the frame.
-    fn beside(self) -> usize {
-        if self.measured { 1 + self.channels } else { 0 }
+        UnetSpec { ends: (colors + 1, colors), widths: self.widths, depth: self.depth }
     }
 }
 
@@ -82,8 +63,7 @@ impl std::fmt::Display for ShiftnetSpec {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let colors = if self.channels == 1 { "gray" } else { "color" };
         let [a, b, c] = self.widths;
-        let measured = if self.measured { ", measured" } else { "" };
-        write!(f, "ShiftNet ({colors}, {a}/{b}/{c} channels, depth {}{measured})", self.depth)
+        write!(f, "ShiftNet ({colors}, {a}/{b}/{c} channels, depth {})", self.depth)
     }
 }
 
@@ -95,8 +75,6 @@ pub struct Shiftnet {
     spec: ShiftnetSpec,
     convs: Vec<Conv>,
     cache: Cache,
-    /// Of a solve: the iteration, and the result `[T, C, H, W]` that the data step goes on from.
-    last: Option<(usize, Array4<f32>)>,
 }
 
 impl Shiftnet {
@@ -136,7 +114,7 @@ impl Shiftnet {
     }
 
     fn build(spec: ShiftnetSpec, source: &mut Source<'_>) -> Result<Self> {
-        Ok(Self { spec, convs: spec.body().build(source, PREFIX)?, cache: Cache::default(), last: None })
+        Ok(Self { spec, convs: spec.body().build(source, PREFIX)?, cache: Cache::default() })
     }
 
     /// Its size.
@@ -144,42 +122,25 @@ impl Shiftnet {
         self.spec
     }
 
-    /// A clip `[T, C, H, W]` without a tensor in the loop, `beside` as in [`Network::forward_beside`]; arguments have been checked.
-    fn infer(
-        &mut self,
-        clip: ArrayView4<'_, f32>,
-        sigma: f32,
-        beside: Option<ArrayView4<'_, f32>>,
-        mut out: ArrayViewMut4<'_, f32>,
-    ) -> Result<()> {
+    /// A clip `[T, C, H, W]` without a tensor in the loop; arguments have been checked.
+    fn infer(&mut self, clip: ArrayView4<'_, f32>, sigma: f32, mut out: ArrayViewMut4<'_, f32>) -> Result<()> {
         let (_, channels, height, width) = clip.dim();
         let half = |n: usize| n.next_multiple_of(MULTIPLE) / 2;
         let (half_h, half_w) = (half(height), half(width));
         let body = self.spec.body();
         let (shuffled, plain) = body.results(1);
-        let black_image = Array2::zeros((height, width));
         let convs: Vec<&Conv> = self.convs.iter().collect();
         let engine = self.cache.engine(&convs, &shuffled, &plain)?;
         engine.start(half_h, half_w);
         let mut features = Vec::with_capacity(clip.len_of(Axis(0)));
-        for (t, frame) in clip.outer_iter().enumerate() {
+        for frame in clip.outer_iter() {
             let mut shown = engine.image(body.ends.0, half_h, half_w);
-            let mut show = |first: usize, image: ArrayView2<'_, f32>, black: f32, scale: f32| {
-                for (i, j) in (0..PHASES).map(|phase| (phase / 2, phase % 2)) {
-                    set_channel(&mut shown, first + 2 * i + j, |y| {
-                        let row = image.index_axis_move(Axis(0), Padding::Reflect.source(2 * y + i, height));
-                        (0..half_w).map(move |x| (row[Padding::Reflect.source(2 * x + j, width)] - black) * scale)
-                    });
-                }
-            };
-            for (color, image) in frame.outer_iter().enumerate() {
-                show(PHASES * color, image, GRAY, 1.0);
-            }
-            let first = PHASES * channels + 1;
-            for (k, (black, scale)) in self.spec.shades().enumerate() {
-                let nothing = black_image.view();
-                let image = beside.map_or(nothing, |beside| beside.slice_move(s![t, k, .., ..]));
-                show(first + PHASES * k, image, if beside.is_some() { black } else { 0.0 }, scale);
+            for channel in 0..PHASES * channels {
+                let (color, i, j) = (channel / PHASES, channel / 2 % 2, channel % 2);
+                set_channel(&mut shown, channel, |y| {
+                    let row = frame.slice(s![color, Padding::Reflect.source(2 * y + i, height), ..]);
+                    (0..half_w).map(move |x| row[Padding::Reflect.source(2 * x + j, width)] - GRAY)
+                });
             }
             set_channel(&mut shown, PHASES * channels, |_| std::iter::repeat(sigma));
             features.push(engine.conv(0, &shown)?);
@@ -233,26 +194,9 @@ impl Layers for Shiftnet {
 
 impl Network for Shiftnet {
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor> {
-        self.forward_beside(clips, noise, None)
-    }
-
-    fn measured(&self) -> bool {
-        self.spec.measured
-    }
-
-    fn forward_beside(&self, clips: &Tensor, noise: &[f32], beside: Option<&Tensor>) -> Result<Tensor> {
         let (n, _, h, w) = check_clips(self, clips, noise)?;
-        let phases =
-            |x: &Tensor| -> candle_core::Result<Tensor> { pixel_unshuffle(&Padding::Reflect.pad(x, MULTIPLE)?, 2) };
-        let x = phases(clips)?;
-        let mut shown = vec![(&x - f64::from(GRAY))?, noise_map(n, noise, &x)?];
-        for (k, (black, scale)) in self.spec.shades().enumerate() {
-            shown.push(match beside {
-                Some(beside) => ((phases(&beside.narrow(1, k, 1)?)? - f64::from(black))? * f64::from(scale))?,
-                None => x.narrow(1, 0, PHASES)?.zeros_like()?,
-            });
-        }
-        let shown = Tensor::cat(&shown, 1)?;
+        let x = pixel_unshuffle(&Padding::Reflect.pad(clips, MULTIPLE)?, 2)?;
+        let shown = Tensor::cat(&[&(&x - f64::from(GRAY))?, &noise_map(n, noise, &x)?], 1)?;
         let (found, _) = self.spec.body().forward(&self.convs, &shown, None, n / noise.len())?;
         Ok(crop(&pixel_shuffle(&(x + found)?, 2)?, h, w)?)
     }
@@ -267,7 +211,7 @@ impl Denoiser for Shiftnet {
         &mut self,
         call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
-        mut out: ArrayViewMut4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         let sigma = call.required_sigma()?;
         check_video(self, sigma, noisy, &out)?;
@@ -275,17 +219,12 @@ impl Denoiser for Shiftnet {
             return Ok(());
         }
         let device = self.device();
-        let before = self.last.take().filter(|(iteration, _)| iteration + 1 == call.iteration).map(|(_, last)| last);
-        let measurement = call.measurement.filter(|_| self.spec.measured);
-        let beside = measurement.map(|measurement| beside(measurement, noisy, before.as_ref().map(|v| v.view())));
         if device.is_cpu() {
-            self.infer(noisy, sigma, beside.as_ref().map(|beside| beside.view()), out.view_mut())?;
+            self.infer(noisy, sigma, out)?;
         } else {
-            let beside = beside.map(|beside| to_tensor(beside.view(), &device)).transpose().map_err(Error::from)?;
-            let clean = self.forward_beside(&to_tensor(noisy, &device)?, &[sigma], beside.as_ref())?;
-            copy_to(&clean, out.view_mut()).map_err(Error::from)?;
+            let clean = self.forward(&to_tensor(noisy, &device)?, &[sigma])?;
+            copy_to(&clean, out).map_err(Error::from)?;
         }
-        self.last = measurement.map(|_| (call.iteration, out.to_owned()));
         Ok(())
     }
 }
@@ -293,14 +232,12 @@ impl Denoiser for Shiftnet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::concatenate;
+    use ndarray::{Array4, concatenate};
     use rand::RngExt;
-    use sci_forward::{MaskOperator, MaskStack, Measurement};
-    use std::sync::Arc;
 
     /// A network no layer of which is silent.
-    fn loud(channels: usize, measured: bool) -> Shiftnet {
-        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], depth: 2, measured };
+    fn loud(channels: usize) -> Shiftnet {
+        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], depth: 2 };
         let mut net = Shiftnet::random(spec, 1).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         for (_, tensor, _) in net.convs.iter_mut().flat_map(Conv::tensors_mut) {
@@ -328,7 +265,7 @@ mod tests {
     #[test]
     fn inference_is_the_differentiable_network_at_any_size() {
         for dim in [(1, 1, 1, 1), (5, 1, 9, 14), (2, 3, 16, 7), (3, 3, 24, 40)] {
-            let (mut net, noisy, mut out) = (loud(dim.1, false), clip(dim, 3), Array4::zeros(dim));
+            let (mut net, noisy, mut out) = (loud(dim.1), clip(dim, 3), Array4::zeros(dim));
             net.denoise(&Call::new(0.1), noisy.view(), out.view_mut()).unwrap();
             let error = difference(&out, &forward(&net, noisy.view(), &[0.1]));
             assert!(error < 1e-4, "{dim:?}: {error}");
@@ -336,39 +273,8 @@ mod tests {
     }
 
     #[test]
-    fn inference_is_shown_how_frames_were_measured() {
-        let dim = (4, 1, 9, 14);
-        let (masks, noisy, before) = (clip(dim, 8), clip(dim, 3), clip(dim, 9));
-        let stack = MaskStack::new(masks.index_axis(Axis(1), 0).to_owned()).unwrap();
-        let measurement = Measurement::new(Arc::new(MaskOperator::new(stack)), Array2::ones((9, 14))).unwrap();
-        let told = Call { iteration: 1, measurement: Some(&measurement), ..Call::new(0.1) };
-        let mut net = loud(1, true);
-        let mut denoised = |last: Option<(usize, Array4<f32>)>, call: &Call<'_>| {
-            let mut out = Array4::zeros(dim);
-            net.last = last;
-            net.denoise(call, noisy.view(), out.view_mut()).unwrap();
-            out
-        };
-        let (first, next) = (denoised(None, &told), denoised(Some((0, before.clone())), &told));
-        let (stale, untold) = (denoised(Some((5, before.clone())), &told), denoised(None, &Call::new(0.1)));
-        let expected = |beside: Option<Array4<f32>>| {
-            let beside = beside.map(|beside| to_tensor(beside.view(), &net.device()).unwrap());
-            let found = net.forward_beside(&to_tensor(noisy.view(), &net.device()).unwrap(), &[0.1], beside.as_ref());
-            let mut out = Array4::zeros(dim);
-            copy_to(&found.unwrap(), out.view_mut()).unwrap();
-            out
-        };
-        assert!(difference(&untold, &expected(None)) < 1e-4);
-        assert!(difference(&first, &expected(Some(beside(&measurement, noisy.view(), None)))) < 1e-4);
-        assert!(difference(&next, &expected(Some(beside(&measurement, noisy.view(), Some(before.view()))))) < 1e-4);
-        assert!(
-            difference(&stale, &first) == 0.0 && difference(&next, &first) > 1e-3 && difference(&first, &untold) > 1e-3
-        );
-    }
-
-    #[test]
     fn clips_of_a_batch_do_not_see_each_other() {
-        let (net, one, other) = (loud(1, false), clip((3, 1, 8, 16), 4), clip((3, 1, 8, 16), 5));
+        let (net, one, other) = (loud(1), clip((3, 1, 8, 16), 4), clip((3, 1, 8, 16), 5));
         let both = concatenate![Axis(0), one, other];
         let alone = concatenate![Axis(0), forward(&net, one.view(), &[0.1]), forward(&net, other.view(), &[0.3])];
         assert!(difference(&forward(&net, both.view(), &[0.1, 0.3]), &alone) < 1e-5);
@@ -376,7 +282,7 @@ mod tests {
 
     #[test]
     fn a_frame_is_seen_by_its_neighbours_and_noise_by_all() {
-        let (net, still) = (loud(1, false), clip((3, 1, 8, 8), 6));
+        let (net, still) = (loud(1), clip((3, 1, 8, 8), 6));
         let result = forward(&net, still.view(), &[0.1]);
         let mut moved = still.clone();
         moved.index_axis_mut(Axis(0), 0).fill(0.0);
@@ -389,8 +295,7 @@ mod tests {
 
     #[test]
     fn an_untrained_network_gives_back_what_it_is_shown() {
-        let net =
-            Shiftnet::random(ShiftnetSpec { channels: 1, widths: [16, 16, 16], depth: 1, measured: false }, 0).unwrap();
+        let net = Shiftnet::random(ShiftnetSpec { channels: 1, widths: [16, 16, 16], depth: 1 }, 0).unwrap();
         let noisy = clip((2, 1, 8, 8), 7);
         assert!(difference(&forward(&net, noisy.view(), &[0.1]), &noisy) < 1e-6);
     }

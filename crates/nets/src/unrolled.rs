@@ -12,7 +12,7 @@ use admm::{
 };
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
-use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Axis};
 use sci_forward::bayer::{Malvar, Menon, mosaic_adjoint_into};
 use sci_forward::{Demosaicer, Measurement, SensingOperator};
 use std::fmt::Display;
@@ -41,24 +41,6 @@ pub struct RecordedCall {
     pub sigma: f32,
     /// Its number, from 0.
     pub iteration: usize,
-    /// How the input was measured, as in [`Network::forward_beside`], if the denoiser was told.
-    pub beside: Option<Array4<f32>>,
-}
-
-/// How frames `x [T, C, H, W]` of a solve were measured, as in [`Network::forward_beside`]: their masks, and what the data step changed in the
-/// result `v` of the call before (in the first call: nothing).
-pub(crate) fn beside(measurement: &Measurement, x: ArrayView4<'_, f32>, v: Option<ArrayView4<'_, f32>>) -> Array4<f32> {
-    let (frames, channels, height, width) = x.dim();
-    // What a sensor that sees 1 everywhere passes on: the mask of each frame.
-    let masks = measurement.operator().adjoint(Array2::ones((height, width)).view());
-    let squares: f64 = masks.iter().map(|&c| f64::from(c) * f64::from(c)).sum();
-    let scale = (2.0 * squares / masks.len().max(1) as f64).sqrt().max(f64::MIN_POSITIVE) as f32;
-    let mut beside = Array4::zeros((frames, 1 + channels, height, width));
-    beside.index_axis_mut(Axis(1), 0).assign(&(masks / scale));
-    if let Some(v) = v {
-        beside.slice_mut(s![.., 1.., .., ..]).assign(&(&x - &v));
-    }
-    beside
 }
 
 /// A loss, and its gradient for each variable (nothing for those it does not depend on).
@@ -132,8 +114,7 @@ impl Recipe {
         calls: Vec<usize>,
     ) -> Result<Vec<RecordedCall>> {
         let count = calls.last().map_or(0, |last| last + 1);
-        let denoiser = self.turning(denoiser);
-        let mut recorder = Recorder { denoiser, calls, seen: Vec::new(), told: !self.flips, last: None };
+        let mut recorder = Recorder { denoiser: self.turning(denoiser), calls, seen: Vec::new() };
         self.solve_calls(measurement, Box::new(&mut recorder), count)?;
         Ok(recorder.seen)
     }
@@ -199,9 +180,7 @@ impl Recipe {
         let mut to_momentum = Array2::zeros(measurement.shape().image_dim());
         for call in calls.iter().rev() {
             let input = Var::from_tensor(&tensor(call.input.clone())?)?;
-            let told = call.beside.as_ref().filter(|_| network.measured());
-            let beside = told.map(|beside| Ok::<_, Error>(Var::from_tensor(&tensor(beside.clone())?)?)).transpose()?;
-            let v = self.denoised(network, &input, beside.as_deref(), call)?;
+            let v = self.denoised(network, &input, call)?;
             let values = Array4::from_shape_vec(v.dims4()?, v.flatten_all()?.to_vec1::<f32>()?).map_err(unusable)?;
             let (own, mut upstream) = loss(values.view()).map_err(unusable)?;
             upstream *= share;
@@ -213,36 +192,18 @@ impl Recipe {
             share *= 0.5;
             if let Some(to_input) = gradients.get(&input) {
                 let to_input = to_input.flatten_all()?.to_vec1()?;
-                let mut to_input = Array4::from_shape_vec(input.dims4()?, to_input).map_err(unusable)?;
-                // x − v, of the x and v on both sides of the data step.
-                let to_change = beside.as_ref().and_then(|beside| gradients.get(beside)).map(changes).transpose()?;
-                to_change.iter().for_each(|to_change| to_input += to_change);
-                let mut to_result = self.through_iteration(measurement, to_input, &mut to_momentum)?;
-                to_change.iter().for_each(|to_change| to_result -= to_change);
-                back = Some(to_result);
+                let to_input = Array4::from_shape_vec(input.dims4()?, to_input).map_err(unusable)?;
+                back = Some(self.through_iteration(measurement, to_input, &mut to_momentum)?);
             }
         }
         Ok(total)
     }
 
     /// The result of a call, which sees its input as [`Flips`] turns it, in less light.
-    fn denoised(
-        &self,
-        network: &dyn Network,
-        input: &Tensor,
-        beside: Option<&Tensor>,
-        call: &RecordedCall,
-    ) -> Result<Tensor> {
+    fn denoised(&self, network: &dyn Network, input: &Tensor, call: &RecordedCall) -> Result<Tensor> {
         let axes: Vec<usize> = flipped_axes(call.iteration).filter(|_| self.flips).map(|axis| axis.index()).collect();
         let (less, more) = (f64::from(1.0 / self.dim), f64::from(self.dim));
-        let input = (input * less)?.flip(&axes)?;
-        // The masks stay what they are in less light, what changed does not.
-        let dimmed = |beside: &Tensor| {
-            let changes = beside.narrow(1, 1, beside.dim(1)? - 1)?;
-            Tensor::cat(&[beside.narrow(1, 0, 1)?, (changes * less)?], 1)
-        };
-        let beside = beside.map(dimmed).transpose()?;
-        Ok((network.forward_beside(&input, &[call.sigma], beside.as_ref())?.flip(&axes)? * more)?)
+        Ok((network.forward(&(input * less)?.flip(&axes)?, &[call.sigma])?.flip(&axes)? * more)?)
     }
 
     /// From the gradient by the input of a call to that by the result of the call before, both `[T, C, H, W]`.
@@ -290,22 +251,11 @@ impl Recipe {
     }
 }
 
-/// Of the gradient by what a network is shown beside the frames: that by the changes.
-fn changes(to_beside: &Tensor) -> Result<Array4<f32>> {
-    let (frames, images, height, width) = to_beside.dims4()?;
-    let values = to_beside.narrow(1, 1, images - 1)?.flatten_all()?.to_vec1()?;
-    Array4::from_shape_vec((frames, images - 1, height, width), values).map_err(unusable)
-}
-
 /// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
 struct Recorder<'d> {
     denoiser: Box<dyn Denoiser + 'd>,
     calls: Vec<usize>,
     seen: Vec<RecordedCall>,
-    /// Whether the denoiser is told how frames were measured.
-    told: bool,
-    /// Its last result.
-    last: Option<Array4<f32>>,
 }
 
 impl Denoiser for Recorder<'_> {
@@ -320,22 +270,14 @@ impl Denoiser for Recorder<'_> {
         mut out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
         if self.calls.contains(&call.iteration) {
-            let measurement = call.measurement.filter(|_| self.told);
-            let last = self.last.as_ref().map(|last| last.view());
-            self.seen.push(RecordedCall {
-                input: noisy.as_standard_layout().into_owned(),
-                sigma: call.required_sigma()?,
-                iteration: call.iteration,
-                beside: measurement.map(|measurement| beside(measurement, noisy, last)),
-            });
+            let input = noisy.as_standard_layout().into_owned();
+            self.seen.push(RecordedCall { input, sigma: call.required_sigma()?, iteration: call.iteration });
         }
         if self.seen.len() == self.calls.len() {
             out.assign(&noisy);
             return Ok(());
         }
-        self.denoiser.denoise(call, noisy, out.view_mut())?;
-        self.last = self.told.then(|| out.to_owned());
-        Ok(())
+        self.denoiser.denoise(call, noisy, out)
     }
 }
 
@@ -361,9 +303,7 @@ pub(crate) fn tensor(video: Array4<f32>) -> Result<Tensor> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Shiftnet, ShiftnetSpec};
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
+    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers};
     use sci_forward::bayer::mosaic_into;
     use sci_forward::{CfaPattern, MaskOperator, MaskStack, VideoShape};
     use std::sync::Arc;
@@ -374,32 +314,9 @@ mod tests {
     fn the_gradient_is_that_of_the_whole_loss() {
         let clip = Array4::from_shape_fn((3, 1, 12, 12), |(t, _, y, x)| ((7 * t + 5 * y + 3 * x) % 11) as f32 / 11.0);
         for accelerate in [true, false] {
-            let (slope, norm) = slope_along_gradient(ffdnet(1), clip.clone(), (accelerate, true));
+            let (slope, norm) = slope_along_gradient(clip.clone(), accelerate);
             assert!((slope - norm).abs() < 0.01 * norm, "slope {slope}, gradient {norm}");
         }
-    }
-
-    /// Of a network that is shown how frames were measured also through what the data step changed.
-    #[test]
-    fn the_gradient_of_a_measured_network_is_that_of_the_whole_loss() {
-        let clip = Array4::from_shape_fn((3, 1, 16, 16), |(t, _, y, x)| ((7 * t + 5 * y + 3 * x) % 11) as f32 / 11.0);
-        for accelerate in [true, false] {
-            let spec = ShiftnetSpec { channels: 1, widths: [16, 16, 16], depth: 1, measured: true };
-            let mut net = Shiftnet::random(spec, 1).unwrap();
-            // No layer is silent.
-            let mut rng = ChaCha8Rng::seed_from_u64(3);
-            for (_, tensor, _) in net.convs_mut().into_iter().flat_map(|conv| conv.tensors_mut()) {
-                let values: Vec<f32> = (0..tensor.elem_count()).map(|_| 0.1 * (rng.random::<f32>() - 0.5)).collect();
-                *tensor = (&*tensor + Tensor::from_vec(values, tensor.shape(), tensor.device()).unwrap()).unwrap();
-            }
-            let (slope, norm) = slope_along_gradient(net, clip.clone(), (accelerate, false));
-            assert!((slope - norm).abs() < 0.01 * norm, "slope {slope}, gradient {norm}");
-        }
-    }
-
-    fn ffdnet(channels: usize) -> Ffdnet {
-        let layout = FfdnetLayout::Residual { batch_norm: false };
-        Ffdnet::random(FfdnetSpec { channels, width: 8, depth: 3, layout }, 1).unwrap()
     }
 
     /// In color the demosaicing's part is an approximation.
@@ -408,7 +325,7 @@ mod tests {
         let wave =
             |t: usize, c: usize, y: usize, x: usize| (0.5 * (t + y) as f32 + 0.3 * x as f32 + 0.7 * c as f32).sin();
         let clip = Array4::from_shape_fn((3, 3, 12, 12), |(t, c, y, x)| 0.5 + 0.3 * wave(t, c, y, x));
-        let (slope, norm) = slope_along_gradient(ffdnet(3), clip, (true, true));
+        let (slope, norm) = slope_along_gradient(clip, true);
         assert!((slope - norm).abs() < 0.25 * norm, "slope {slope}, gradient {norm}");
     }
 
@@ -427,13 +344,12 @@ mod tests {
     }
 
     /// How the loss of three calls changes along its gradient by difference, and the gradient's length.
-    fn slope_along_gradient<N: Network + Denoiser + Clone>(
-        mut net: N,
-        clip: Array4<f32>,
-        (accelerate, flips): (bool, bool),
-    ) -> (f64, f64) {
+    fn slope_along_gradient(clip: Array4<f32>, accelerate: bool) -> (f64, f64) {
+        let channels = clip.len_of(Axis(1));
+        let spec = FfdnetSpec { channels, width: 8, depth: 3, layout: FfdnetLayout::Residual { batch_norm: false } };
+        let mut net = Ffdnet::random(spec, 1).unwrap();
         let sigmas = [40.0, 30.0, 20.0].map(|sigma| sigma / 255.0).to_vec();
-        let recipe = Recipe { sigmas, accelerate, start: None, flips, dim: 1.3 };
+        let recipe = Recipe { sigmas, accelerate, start: None, flips: true, dim: 1.3 };
         let (measurement, vars) = (measured(&clip), net.make_trainable().unwrap());
         let squared = |v: ArrayView4<'_, f32>| {
             let error = &v - &clip;
@@ -441,11 +357,10 @@ mod tests {
             Ok((error.iter().map(|e| e * e).sum::<f32>() / count, error * (2.0 / count)))
         };
 
-        let loss_at = |net: &mut N| -> f64 {
+        let loss_at = |net: &mut Ffdnet| -> f64 {
             let mut seen = Vec::new();
             for call in recipe.record(&measurement, net, vec![0, 1, 2]).unwrap() {
-                let beside = call.beside.clone().map(|beside| tensor(beside).unwrap());
-                let v = recipe.denoised(net, &tensor(call.input.clone()).unwrap(), beside.as_ref(), &call).unwrap();
+                let v = recipe.denoised(net, &tensor(call.input.clone()).unwrap(), &call).unwrap();
                 let v = v.flatten_all().unwrap().to_vec1::<f32>().unwrap();
                 let squares = v.iter().zip(&clip).map(|(v, clean)| f64::from(v - clean).powi(2));
                 seen.push(squares.sum::<f64>() / clip.len() as f64);
@@ -468,7 +383,7 @@ mod tests {
                 var.set(&Tensor::from_vec(new, var.shape(), var.device()).unwrap()).unwrap();
             }
             let state = net.state();
-            let mut plain = net.clone();
+            let mut plain = Ffdnet::random(spec, 1).unwrap();
             plain.set_state(&state).unwrap();
             loss_at(&mut plain)
         };

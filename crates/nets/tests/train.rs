@@ -147,13 +147,8 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.noise = None;
     config.data.frames = 1;
     config.data.batch = 1;
-    config.iterates = Some(IteratesConfig {
-        sigmas: vec![50.0, 25.0, 12.0],
-        calls: 2,
-        unrolled: false,
-        flips: true,
-        start_iterations: 2,
-    });
+    config.iterates =
+        Some(IteratesConfig { sigmas: vec![50.0, 25.0, 12.0], calls: 2, unrolled: false, start_iterations: 2 });
     config.camera = Some(camera());
     config
 }

@@ -90,9 +90,6 @@ pub enum NetworkConfig {
         widths: [usize; 3],
         /// Residual blocks at an eighth of the size, 1 to 16.
         depth: usize,
-        /// Whether it is shown how frames were measured. Default false.
-        #[serde(default)]
-        measured: bool,
     },
     /// [`UnfoldingNet`](crate::UnfoldingNet).
     Unfolding {
@@ -125,9 +122,7 @@ impl NetworkConfig {
             Self::Ffdnet { channels, width, depth } => Self::ffdnet(channels, width, depth).validate().map(drop),
             Self::Fastdvdnet { channels, widths, .. } => Self::fastdvdnet(channels, widths).block().map(drop),
             Self::Ddnet { widths, .. } => check_widths(widths),
-            Self::Shiftnet { channels, widths, depth, measured } => {
-                ShiftnetSpec { channels, widths, depth, measured }.validate().map(drop)
-            }
+            Self::Shiftnet { channels, widths, depth } => ShiftnetSpec { channels, widths, depth }.validate().map(drop),
             Self::Unfolding { channels, iterations, widths, depth } => {
                 Self::unfolding(channels, iterations, widths, depth).validate().map(drop)
             }
@@ -245,9 +240,6 @@ pub struct IteratesConfig {
     /// next. Default false: calls drawn at random, each by itself.
     #[serde(default)]
     pub unrolled: bool,
-    /// Whether the network sees the video another way round in every call; it is not shown then how it was measured. Default true.
-    #[serde(default = "yes")]
-    pub flips: bool,
 }
 
 /// Training of an unfolding network: each clip is measured by a new simulated camera, and the loss is that of the result of every
@@ -406,9 +398,6 @@ fn average() -> f64 {
 fn random_masks() -> Vec<MaskKind> {
     vec![MaskKind::Random]
 }
-fn yes() -> bool {
-    true
-}
 fn hundred() -> u32 {
     100
 }
@@ -486,7 +475,7 @@ impl TrainConfig {
     }
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig { sigmas, start_iterations, calls, unrolled: _, flips: _ } = iterates;
+        let IteratesConfig { sigmas, start_iterations, calls, unrolled: _ } = iterates;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
         check(
             !sigmas.is_empty() && sigmas.iter().all(|&s| level(s)),

@@ -46,7 +46,7 @@ impl IteratesConfig {
             sigmas: self.sigmas.iter().map(|s| s / 255.0).collect(),
             accelerate: true,
             start: (self.start_iterations > 0).then_some((self.start_iterations, START_WEIGHT)),
-            flips: self.flips,
+            flips: true,
             dim: 1.0,
         }
     }
@@ -84,8 +84,7 @@ mod tests {
     /// Validation goes on with a network that has gone astray.
     #[test]
     fn a_solve_that_diverges_has_a_finite_result_of_the_clips_size() {
-        let settings =
-            IteratesConfig { sigmas: vec![40.0, 20.0], calls: 1, unrolled: false, flips: true, start_iterations: 2 };
+        let settings = IteratesConfig { sigmas: vec![40.0, 20.0], calls: 1, unrolled: false, start_iterations: 2 };
         let camera = CameraConfig {
             frames: [2, 2],
             density: [0.5, 0.5],

@@ -84,8 +84,8 @@ impl Model {
             NetworkConfig::Ddnet { widths, ends } => {
                 Self::Ddnet(Ddnet::random(NetworkConfig::ddnet(widths), ends, seed)?)
             }
-            NetworkConfig::Shiftnet { channels, widths, depth, measured } => {
-                Self::Shiftnet(Shiftnet::random(ShiftnetSpec { channels, widths, depth, measured }, seed)?)
+            NetworkConfig::Shiftnet { channels, widths, depth } => {
+                Self::Shiftnet(Shiftnet::random(ShiftnetSpec { channels, widths, depth }, seed)?)
             }
             NetworkConfig::Unfolding { channels, iterations, widths, depth } => {
                 let spec = NetworkConfig::unfolding(channels, iterations, widths, depth);
@@ -273,8 +273,7 @@ impl Trainer {
         })
     }
 
-    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`]. They may be of a network that is shown
-    /// less.
+    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
     ///
     /// # Errors
     /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
@@ -284,13 +283,7 @@ impl Trainer {
             let legal = "parts of the names of the network's layers".to_owned();
             return Err(Error::Setting { key: "renew", value: part.clone(), legal });
         }
-        let mut weights = weights.clone();
-        for (name, tensor) in &mut weights {
-            if let Some(own) = random.get(name) {
-                *tensor = widened(tensor, own)?;
-            }
-        }
-        self.model.layers_mut().set_state(&weights)?;
+        self.model.layers_mut().set_state(weights)?;
         let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
         let state = self.model.layers().state().into_iter().chain(renewed).collect();
         self.model.layers_mut().set_state(&state)?;
@@ -762,17 +755,6 @@ impl Trainer {
         self.random = meta.random;
         self.rate = meta.rate;
         Ok(())
-    }
-}
-
-/// The filters of a network that was shown less than `own`: what is new begins without effect.
-fn widened(filters: &Tensor, own: &Tensor) -> Result<Tensor> {
-    match (filters.dims(), own.dims()) {
-        (&[o, i, h, w], &[outputs, inputs, height, width]) if i < inputs && [o, h, w] == [outputs, height, width] => {
-            let new = Tensor::zeros((o, inputs - i, h, w), filters.dtype(), filters.device())?;
-            Ok(Tensor::cat(&[filters, &new], 1)?)
-        }
-        _ => Ok(filters.clone()),
     }
 }
 
