@@ -1,14 +1,11 @@
-//! Experiment files that extend others, the unfolding network as a denoiser, and the count of networks' work.
+//! Experiment files that extend others, and the count of networks' work.
 
 use std::path::Path;
 
 use e2e::{Bench, Finished, workspace};
 use ndarray::ArrayD;
 use ndarray_npy::read_npy;
-use nets::weights::{Storage, write_safetensors};
-use nets::{Layers, UnfoldingNet, UnfoldingSpec};
-
-const GRAY: UnfoldingSpec = UnfoldingSpec { channels: 1, iterations: 2, widths: [16; 3], depth: 1 };
+use nets::Layers;
 
 /// The demo's video through masks of two frames, denoised once by TV.
 fn config() -> String {
@@ -93,77 +90,6 @@ fn what_cannot_be_extended_is_refused() {
     bench.write("b.toml", "extends = \"a.toml\"\n");
     fails(&bench, "a.toml", &[], 2, &["b.toml:1:", "`extends` = \"a.toml\"", "cannot extend itself", "a.toml → "]);
     fails(&bench, "base.toml", &["extends=b.toml"], 2, &["--set extends=b.toml:", "line of a file"]);
-}
-
-/// Writes an untrained network that adds `bias` to all that it is shown.
-fn write_network(bench: &Bench, name: &str, spec: UnfoldingSpec, bias: f64) {
-    let mut state = UnfoldingNet::random(spec, 0).unwrap().state();
-    for (_, tensor) in state.iter_mut().filter(|(name, _)| name.ends_with("output.bias")) {
-        *tensor = (&*tensor + bias).unwrap();
-    }
-    write_safetensors(&bench.path(name), &state, Storage::F32).unwrap();
-}
-
-const UNFOLDING: &str = "denoiser={kind=\"unfolding\",weights=\"net.safetensors\"}";
-
-#[test]
-fn an_unfolding_network_solves_as_far_as_it_is_let() {
-    let bench = bench();
-    let spec = GRAY;
-    let recon = || read_npy::<_, ArrayD<f32>>(bench.path("out/recon.npy")).unwrap();
-    write_network(&bench, "net.safetensors", spec, 0.0);
-    runs(&bench, "base.toml", &[UNFOLDING]);
-    let silent = recon();
-    write_network(&bench, "net.safetensors", spec, 0.125);
-    let record = runs(&bench, "base.toml", &[UNFOLDING]);
-    let biased = recon();
-    assert!(silent.len() > 1000);
-    assert!(silent.iter().zip(&biased).all(|(s, b)| (b - s - 0.125).abs() < 1e-5));
-    assert_eq!((&record["denoiser"], &record["precision_used"]), (&"unfolding".into(), &"f32".into()));
-    // One iteration is half of the network, four are twice as much.
-    let each = spec.multiply_adds() / 2.0 * biased.len() as f64 / 1e9;
-    for iterations in [1, 2, 4] {
-        let record = runs(&bench, "base.toml", &[UNFOLDING, &format!("stage.0.iterations={iterations}")]);
-        let gmac = record["measurements"][0]["gmac"].as_f64().unwrap();
-        assert!((gmac / (each * f64::from(iterations)) - 1.0).abs() < 1e-6, "{gmac} for {iterations} × {each}");
-    }
-}
-
-#[test]
-fn an_unfolding_network_is_for_its_own_kind_of_sensor() {
-    let bench = bench();
-    write_network(&bench, "net.safetensors", UnfoldingSpec { channels: 3, ..GRAY }, 0.0);
-    fails(&bench, "base.toml", &[UNFOLDING], 1, &["denoiser.weights", "3 channels", "is gray", "data.cfa"]);
-    let record = runs(&bench, "base.toml", &[UNFOLDING, "data.cfa=bggr", "stage.0.iterations=2"]);
-    assert!(record["measurements"][0]["psnr_db"].as_f64().unwrap() > 10.0);
-    let recon = read_npy::<_, ArrayD<f32>>(bench.path("out/recon.npy")).unwrap();
-    assert!(recon.ndim() == 4 && recon.shape().contains(&3), "{:?}", recon.shape());
-    write_network(&bench, "net.safetensors", GRAY, 0.0);
-    fails(&bench, "base.toml", &[UNFOLDING, "data.cfa=bggr"], 1, &["denoiser.weights", "1 channels", "is color"]);
-}
-
-#[test]
-fn what_an_unfolding_network_was_not_trained_for_is_refused() {
-    let bench = bench();
-    write_network(&bench, "net.safetensors", GRAY, 0.0);
-    let flips = "denoiser={kind=\"unfolding\",weights=\"net.safetensors\",flips=true}";
-    let after_tv = "stage=[{iterations=1,denoiser={kind=\"tv\"}},{iterations=1}]";
-    for (set, needles) in [
-        ("solver.accelerate=true", ["--set solver.accelerate=true:", "`solver.accelerate` is true", "legal: false"]),
-        ("solver={kind=\"gap\"}", ["`solver.accelerate` is true", "plain GAP", "legal: false"]),
-        ("solver={kind=\"admm\"}", ["`solver.kind` is \"admm\"", "plain GAP", "legal: gap"]),
-        ("solver={kind=\"two-stage\"}", ["`solver.kind` is \"two-stage\"", "plain GAP", "legal: gap"]),
-        ("solver.start=adjoint", ["--set solver.start=adjoint:", "is neither the mean nor TV", "legal: mean, tv"]),
-        ("stage.0.sigma=10", ["--set stage.0.sigma=10:", "`stage.0.sigma` has no effect", "finds the noise by itself"]),
-        ("online.enabled=true", ["`online.enabled` is true", "does not adapt", "legal: false"]),
-        ("skip.enabled=true", ["`skip.tiles` is true", "the measurement as a whole", "legal: false"]),
-        (flips, ["unknown key `denoiser.flips`", "precision", "weights"]),
-        (after_tv, ["`stage` begins with another denoiser", "from their start", "unfolding"]),
-    ] {
-        fails(&bench, "base.toml", &[UNFOLDING, set], 2, &needles);
-    }
-    let skips = ["skip.enabled=true", "skip.tiles=false", "stage.0.iterations=2"];
-    runs(&bench, "base.toml", &[&[UNFOLDING], &skips[..]].concat());
 }
 
 #[test]

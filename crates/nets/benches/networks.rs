@@ -43,8 +43,8 @@ fn training(c: &mut Criterion) {
         weights: None,
         renew: vec![],
         noise: Some(NoiseConfig { sigma: [0.0, 75.0] }),
+        camera: None,
         iterates: None,
-        snapshots: None,
         training: TrainingConfig {
             steps: u64::MAX,
             optimizer: Optimizer::Muon,

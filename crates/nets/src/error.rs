@@ -41,7 +41,7 @@ pub enum Error {
         known: Vec<&'static str>,
     },
     /// The tensors of a file are not those of any network known here.
-    #[error("{}: no known network has these tensors (FFDNet, FastDVDnet, DDNet and the unfolding network are known); the file has {}", path.display(), list(found))]
+    #[error("{}: no known network has these tensors (FFDNet, FastDVDnet, DDNet and ShiftNet are known); the file has {}", path.display(), list(found))]
     UnknownArchitecture {
         /// The file.
         path: PathBuf,

@@ -25,10 +25,8 @@ pub mod kernels;
 mod layers;
 mod mixed_precision;
 mod network;
-mod shift_unet;
 mod shiftnet;
 pub mod train;
-mod unfolding;
 pub mod unrolled;
 mod video;
 pub mod weights;
@@ -41,7 +39,6 @@ pub use layers::Parameters;
 pub use mixed_precision::{MixedPrecision, PrecisionCounter, PrecisionCounts, SelectPrecision};
 pub use network::{Layers, Network, Window};
 pub use shiftnet::{Shiftnet, ShiftnetSpec};
-pub use unfolding::{Unfolding, UnfoldingNet, UnfoldingPrior, UnfoldingSpec};
 pub use video::Ends;
 pub use weights::WeightFile;
 

@@ -1,19 +1,18 @@
 //! Behaviour of the networks that needs no published weights.
 
-use admm::{Call, Denoiser, Gap, Plan, Stage, Start, Tv, run};
+use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array3, Array4, Axis, concatenate, s};
 use nets::kernels::{Isa, Precision};
 use nets::weights::{Architecture, Storage, convert, write_safetensors};
 use nets::{
     Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers,
-    MixedPrecision, Network, UnfoldingNet, UnfoldingPrior, WeightFile,
+    MixedPrecision, Network, Shiftnet, WeightFile,
 };
 use sci_forward::bayer::{Malvar, mosaic_into};
-use sci_forward::testing::{gaussian, moving_square};
-use sci_forward::{CfaPattern, Demosaicer, MaskOperator, MaskStack, Measurement, Noise, SensingOperator, VideoShape};
+use sci_forward::testing::gaussian;
+use sci_forward::{CfaPattern, Demosaicer};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 /// Both in one object.
 trait NetworkDenoiser: Network + Denoiser {}
@@ -420,29 +419,10 @@ fn bundled_weights_denoise() {
                 lowers_the_noise(name, &mut Fastdvdnet::load(&path, Ends::Circular).unwrap())
             }
             Architecture::Ddnet(_) => fills_in_the_colors(name, &mut Ddnet::load(&path, Ends::Circular).unwrap()),
-            Architecture::Unfolding(_) => improves_on_tv(name, UnfoldingNet::from_weights(file).unwrap()),
+            Architecture::Shiftnet(_) => lowers_the_noise(name, &mut Shiftnet::load(&path).unwrap()),
             other => unreachable!("{name}: no test looks at a bundled {other}"),
         }
     }
-}
-
-/// A noisy measurement of a moving square: the whole solve is far better than the TV that it starts from.
-fn improves_on_tv(name: &str, net: UnfoldingNet) {
-    let shape = VideoShape { frames: 6, height: 48, width: 48 };
-    let truth = moving_square(shape);
-    let operator = MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap());
-    let noisy = Noise::new(None, 0.1).unwrap().apply(operator.forward(truth.view()).view(), 2);
-    let measurement = Measurement::new(Arc::new(operator), noisy).unwrap();
-    let mut solver = Gap::plain(UnfoldingPrior::new(net));
-    let mut error_after = |iterations: usize| {
-        let stage = |iterations| Stage { sigma: None, iterations };
-        let (mut tv, plan) = (Tv::new(0.1), Plan::new([stage(iterations)]));
-        let start = Start::Warm { prior: &mut tv, stage: stage(20) };
-        let outcome = run(&mut solver, &measurement, start, &plan, &mut ()).unwrap();
-        (outcome.estimate.sensor - &truth).mapv(|d| d * d).mean().unwrap()
-    };
-    let (tv, solved) = (error_after(0), error_after(4));
-    assert!(solved < 0.6 * tv, "{name}: {solved:e}, TV {tv:e}");
 }
 
 /// Stripes of two colors, too fine for a mosaic's neighbours to be averaged.

@@ -38,7 +38,6 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
         noise: Some(NoiseConfig { sigma: [0.0, 50.0] }),
         camera: None,
         iterates: None,
-        snapshots: None,
         training: TrainingConfig {
             steps,
             optimizer: Optimizer::Muon,
@@ -113,32 +112,6 @@ fn camera() -> CameraConfig {
         holes: 0.1,
         saturated: 0.2,
         mask_errors: 0.2,
-    }
-}
-
-/// Solves of three iterations, of which a step does all, or two, so that they go on from step to step and over a checkpoint.
-#[test]
-fn an_unfolding_network_learns_from_solves_in_progress_and_resumes() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run.safetensors");
-    for (iterations, at_once) in [(3, 3), (1, 2)] {
-        let network = NetworkConfig::Unfolding { channels: 1, iterations, widths: [16, 16, 16], depth: 1 };
-        let mut config = config(network, 1, 30);
-        config.noise = None;
-        config.camera = Some(camera());
-        config.snapshots = Some(SnapshotsConfig { start_iterations: 2, iterations: 3, at_once });
-        let mut straight = trainer(&config);
-        let before = straight.validate().unwrap();
-        let reports = run(&mut straight, 30);
-        let mut first = trainer(&config);
-        run(&mut first, 9);
-        first.save(&path).unwrap();
-        let mut second = trainer(&config);
-        second.resume(&path).unwrap();
-        assert_eq!(run(&mut second, 21), reports[9..]);
-        assert!(bits(&second) == bits(&straight));
-        let after = straight.validate().unwrap();
-        assert!(after[0].psnr_db > before[0].psnr_db, "{before:?} {after:?}");
     }
 }
 

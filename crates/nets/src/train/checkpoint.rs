@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 const KEY: &str = "checkpoint";
-const SCHEMA: u32 = 4;
+const SCHEMA: u32 = 5;
 
 /// What a checkpoint says beside its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,32 +21,15 @@ pub(super) struct Meta {
     pub(super) step: u64,
     pub(super) adam_steps: u64,
     pub(super) config: TrainConfig,
-    /// Solves in progress, in their order.
-    pub(super) pool: Vec<PoolMeta>,
     /// Whether it began with random weights.
     pub(super) random: bool,
     /// The share of the settings' learning rate that is left after divergences.
     pub(super) rate: f64,
 }
 
-/// What a solve in progress was drawn with, and the iterations that it has behind it and is to have.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct PoolMeta {
-    pub(super) seed: u64,
-    pub(super) done: usize,
-    pub(super) end: usize,
-}
-
 impl Meta {
-    pub(super) fn new(
-        step: u64,
-        adam_steps: u64,
-        config: TrainConfig,
-        pool: Vec<PoolMeta>,
-        random: bool,
-        rate: f64,
-    ) -> Self {
-        Self { schema: SCHEMA, step, adam_steps, config, pool, random, rate }
+    pub(super) fn new(step: u64, adam_steps: u64, config: TrainConfig, random: bool, rate: f64) -> Self {
+        Self { schema: SCHEMA, step, adam_steps, config, random, rate }
     }
 
     /// What is wrong with it.

@@ -3,7 +3,7 @@
 use crate::fastdvdnet::check_widths;
 use crate::kernels::Precision;
 use crate::video::Ends;
-use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec, UnfoldingSpec};
+use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec};
 use candle_core::Tensor;
 use ndarray::Array4;
 use serde::{Deserialize, Serialize};
@@ -29,17 +29,14 @@ pub struct TrainConfig {
     /// shut is at first what it was. Default none.
     #[serde(default)]
     pub renew: Vec<String>,
-    /// The noise put on its input; this, `iterates` or `snapshots`.
+    /// The noise put on its input; this or `iterates`.
     #[serde(default)]
     pub noise: Option<NoiseConfig>,
-    /// What measures the clips of `iterates` and `snapshots`.
+    /// What measures the clips of `iterates`.
     pub camera: Option<CameraConfig>,
     /// The solver whose iterates are its input.
     #[serde(default)]
     pub iterates: Option<IteratesConfig>,
-    /// The cameras whose measurements an unfolding network is trained to solve.
-    #[serde(default)]
-    pub snapshots: Option<SnapshotsConfig>,
     /// How it is trained.
     pub training: TrainingConfig,
     /// How it is watched.
@@ -91,27 +88,15 @@ pub enum NetworkConfig {
         /// Residual blocks at an eighth of the size, 1 to 16.
         depth: usize,
     },
-    /// [`UnfoldingNet`](crate::UnfoldingNet).
-    Unfolding {
-        /// 1 gray, 3 RGB.
-        channels: usize,
-        /// Iterations with weights of their own, 1 to 32; further ones have those of the last.
-        iterations: usize,
-        /// Channels at a half, a quarter and an eighth of the size, multiples of 16 up to 512.
-        widths: [usize; 3],
-        /// Residual blocks at an eighth of the size, 1 to 16.
-        depth: usize,
-    },
 }
 
 impl NetworkConfig {
     /// Colors of a frame: 1 or 3.
     pub fn channels(&self) -> usize {
         match *self {
-            Self::Ffdnet { channels, .. }
-            | Self::Fastdvdnet { channels, .. }
-            | Self::Shiftnet { channels, .. }
-            | Self::Unfolding { channels, .. } => channels,
+            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } | Self::Shiftnet { channels, .. } => {
+                channels
+            }
             Self::Ddnet { .. } => 3,
         }
     }
@@ -123,13 +108,9 @@ impl NetworkConfig {
             Self::Fastdvdnet { channels, widths, .. } => Self::fastdvdnet(channels, widths).block().map(drop),
             Self::Ddnet { widths, .. } => check_widths(widths),
             Self::Shiftnet { channels, widths, depth } => ShiftnetSpec { channels, widths, depth }.validate().map(drop),
-            Self::Unfolding { channels, iterations, widths, depth } => {
-                Self::unfolding(channels, iterations, widths, depth).validate().map(drop)
-            }
         };
         // The network knows its keys, not the table that they are in.
-        const KEYS: [&str; 5] =
-            ["network.channels", "network.width", "network.widths", "network.depth", "network.iterations"];
+        const KEYS: [&str; 4] = ["network.channels", "network.width", "network.widths", "network.depth"];
         checked.map_err(|error| match error {
             Error::Setting { key, value, legal } => {
                 let key = KEYS.into_iter().find(|known| known.ends_with(&format!(".{key}"))).unwrap_or(key);
@@ -149,10 +130,6 @@ impl NetworkConfig {
 
     pub(super) fn ddnet(widths: [usize; 3]) -> DdnetSpec {
         DdnetSpec { widths }
-    }
-
-    pub(super) fn unfolding(channels: usize, iterations: usize, widths: [usize; 3], depth: usize) -> UnfoldingSpec {
-        UnfoldingSpec { channels, iterations, widths, depth }
     }
 }
 
@@ -240,21 +217,6 @@ pub struct IteratesConfig {
     /// next. Default false: calls drawn at random, each by itself.
     #[serde(default)]
     pub unrolled: bool,
-}
-
-/// Training of an unfolding network: each clip is measured by a new simulated camera, and the loss is that of the result of every
-/// iteration of the solve.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SnapshotsConfig {
-    /// Iterations of TV that a solve starts from, 0 to 1000; 0 is y / Σ C. A solve with the network has to start alike. Default 0.
-    #[serde(default)]
-    pub start_iterations: usize,
-    /// Iterations of a solve, 1 to 64: more than the network has weights for are done with those of the last.
-    pub iterations: usize,
-    /// Iterations that one step does and learns from; the solve goes on from there in a later step. 1 to `iterations`: then each step does
-    /// whole solves.
-    pub at_once: usize,
 }
 
 /// The simulated camera that measures each clip, drawn anew for each.
@@ -424,21 +386,16 @@ impl TrainConfig {
         check((1..=1024).contains(&data.batch), "data.batch", data.batch, "1 to 1024")?;
         let beside = self.renew.is_empty() || self.weights.is_some();
         check(beside, "renew", self.renew.join(", "), "only with weights: without them all layers begin anew")?;
-        let unfolds = matches!(self.network, NetworkConfig::Unfolding { .. });
-        let legal = "[snapshots] for an unfolding network, and for no other";
-        check(unfolds == self.snapshots.is_some(), "snapshots", "left out, or of another network", legal)?;
-        let measured = self.iterates.is_some() || self.snapshots.is_some();
-        let legal = "with [iterates] or [snapshots], and only then";
-        check(measured == self.camera.is_some(), "camera", "left out, or not needed", legal)?;
+        let legal = "with [iterates], and only then";
+        check(self.iterates.is_some() == self.camera.is_some(), "camera", "left out, or not needed", legal)?;
         self.camera.iter().try_for_each(|camera| self.validate_camera(camera))?;
-        match (&self.noise, &self.iterates, &self.snapshots) {
-            (Some(NoiseConfig { sigma: [low, high] }), None, None) => {
+        match (&self.noise, &self.iterates) {
+            (Some(NoiseConfig { sigma: [low, high] }), None) => {
                 let ordered = level(*low) && level(*high) && low <= high;
                 check(ordered, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
             }
-            (None, Some(iterates), None) => self.validate_iterates(iterates)?,
-            (None, None, Some(snapshots)) => self.validate_snapshots(snapshots)?,
-            _ => check(false, "noise", "several", "one of the tables [noise], [iterates] and [snapshots]")?,
+            (None, Some(iterates)) => self.validate_iterates(iterates)?,
+            _ => check(false, "noise", "several", "one of the tables [noise] and [iterates]")?,
         }
         check(training.steps >= 1, "training.steps", training.steps, "at least 1")?;
         let rate = training.learning_rate;
@@ -486,15 +443,6 @@ impl TrainConfig {
         check(*start_iterations <= 1000, "iterates.start_iterations", start_iterations, "0 to 1000")?;
         let legal = "1 to the number of iterates.sigmas";
         check((1..=sigmas.len()).contains(calls), "iterates.calls", calls, legal)
-    }
-
-    fn validate_snapshots(&self, snapshots: &SnapshotsConfig) -> Result<()> {
-        let SnapshotsConfig { start_iterations, iterations, at_once } = snapshots;
-        check(self.data.patch.is_multiple_of(8), "data.patch", self.data.patch, "a multiple of 8")?;
-        check((1..=64).contains(iterations), "snapshots.iterations", iterations, "1 to 64")?;
-        let legal = "1 to snapshots.iterations";
-        check((1..=*iterations).contains(at_once), "snapshots.at_once", at_once, legal)?;
-        check(*start_iterations <= 1000, "snapshots.start_iterations", start_iterations, "0 to 1000")
     }
 
     /// Whether a layer, or a variable of one, begins anew.

@@ -4,17 +4,12 @@
 use super::config::IteratesConfig;
 use crate::Result;
 use crate::unrolled::{Recipe, RecordedCall};
-use admm::{Denoiser, Prior, Tv};
+use admm::Denoiser;
 use rand::{Rng, RngExt};
 use sci_forward::Measurement;
 
 /// Weight of the TV prior in the start: the one of the reference's, and of configurations.
 const START_WEIGHT: f32 = 0.1;
-
-/// The prior of the start, for each sub-lattice of a color sensor.
-pub(super) fn start_prior(measurement: &Measurement) -> Box<dyn Prior> {
-    Tv::new(START_WEIGHT).on_sensor(measurement.cfa())
-}
 
 impl IteratesConfig {
     /// What the solver gives the denoiser in some of the calls of a solve, drawn anew: of [`Self::unrolled`] ones consecutive calls. Iterates

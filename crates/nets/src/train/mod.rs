@@ -11,16 +11,14 @@ mod data;
 mod iterates;
 mod muon;
 mod noise;
-mod pool;
 mod revive;
-mod snapshots;
 mod step;
 
 pub use crate::kernels::Precision;
 pub use adam::Adam;
 pub use config::{
     CameraConfig, CheckpointConfig, DataConfig, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig, Optimizer,
-    SnapshotsConfig, TrainConfig, TrainingConfig, ValidationConfig,
+    TrainConfig, TrainingConfig, ValidationConfig,
 };
 pub use data::{Frame, TrainData, frame_from_rgb};
 pub use step::{Resumed, Score, StepReport, Trainer};

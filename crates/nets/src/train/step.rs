@@ -4,17 +4,11 @@ use super::adam::Adam;
 use super::camera;
 use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
-use super::config::{
-    CameraConfig, IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, SnapshotsConfig, TrainConfig, TrainingConfig,
-};
+use super::config::{CameraConfig, IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
 use super::noise::{add_noise, sensor};
-use super::pool::Pool;
 use super::revive::{Idle, State};
-use super::snapshots::{Exercise, cut};
 use crate::layers::Conv;
-use crate::shift_unet::MULTIPLE;
-use crate::unfolding::UnfoldingNet;
 use crate::unrolled::{Gradients, RecordedCall, tensor};
 use crate::weights::{Storage, write_safetensors};
 use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result, Shiftnet, ShiftnetSpec};
@@ -69,7 +63,6 @@ enum Model {
     Fastdvdnet(Fastdvdnet),
     Ddnet(Ddnet),
     Shiftnet(Shiftnet),
-    Unfolding(UnfoldingNet),
 }
 
 impl Model {
@@ -87,10 +80,6 @@ impl Model {
             NetworkConfig::Shiftnet { channels, widths, depth } => {
                 Self::Shiftnet(Shiftnet::random(ShiftnetSpec { channels, widths, depth }, seed)?)
             }
-            NetworkConfig::Unfolding { channels, iterations, widths, depth } => {
-                let spec = NetworkConfig::unfolding(channels, iterations, widths, depth);
-                Self::Unfolding(UnfoldingNet::random(spec, seed)?)
-            }
         })
     }
 
@@ -100,7 +89,6 @@ impl Model {
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
             Self::Shiftnet(net) => net,
-            Self::Unfolding(net) => net,
         }
     }
 
@@ -110,7 +98,6 @@ impl Model {
             Self::Fastdvdnet(net) => net,
             Self::Ddnet(net) => net,
             Self::Shiftnet(net) => net,
-            Self::Unfolding(net) => net,
         }
     }
 
@@ -121,15 +108,6 @@ impl Model {
             Self::Fastdvdnet(net) => Ok(net),
             Self::Ddnet(net) => Ok(net),
             Self::Shiftnet(net) => Ok(net),
-            Self::Unfolding(net) => Err(takes_no_frames(net)),
-        }
-    }
-
-    /// The network of measurements.
-    fn unfolding(&self) -> Result<&UnfoldingNet> {
-        match self {
-            Self::Unfolding(net) => Ok(net),
-            other => Err(Error::Data(format!("{} takes frames, not measurements", other.layers().describe()))),
         }
     }
 
@@ -146,10 +124,6 @@ impl Model {
     }
 }
 
-fn takes_no_frames(net: &UnfoldingNet) -> Error {
-    Error::Data(format!("{} takes measurements, not frames", net.describe()))
-}
-
 /// Clean clips, what the network sees of them (both `[clips · T, C, P, P]`), σ of each.
 struct Batch {
     clean: Tensor,
@@ -163,8 +137,6 @@ enum Lesson {
     Batch(Batch),
     /// Consecutive calls of a solver, and the truth.
     Unrolled { measurement: Box<Measurement>, clean: Array4<f32>, calls: Vec<RecordedCall> },
-    /// Some iterations of the solve of a measurement.
-    Exercise(Box<Exercise>),
 }
 
 /// One training run.
@@ -195,8 +167,6 @@ pub struct Trainer {
     adam: Adam,
     average: Vec<Vec<f32>>,
     idle: Idle,
-    /// Of an unfolding network.
-    pool: Pool,
     /// Whether it began with random weights.
     random: bool,
     /// The share of the settings' learning rate that is left after divergences.
@@ -238,7 +208,6 @@ impl Denoiser for Model {
             Self::Fastdvdnet(net) => net.denoise(call, noisy, out),
             Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
             Self::Shiftnet(net) => net.denoise(call, noisy, out),
-            Self::Unfolding(net) => Err(Box::new(takes_no_frames(net))),
         }
     }
 }
@@ -258,19 +227,7 @@ impl Trainer {
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         let idle = Idle::new(&model.layers().convs(), &vars);
-        Ok(Self {
-            config,
-            data,
-            model,
-            vars,
-            adam,
-            average,
-            idle,
-            pool: Pool::default(),
-            random: true,
-            rate: 1.0,
-            step: 0,
-        })
+        Ok(Self { config, data, model, vars, adam, average, idle, random: true, rate: 1.0, step: 0 })
     }
 
     /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
@@ -377,27 +334,7 @@ impl Trainer {
     }
 
     fn camera(&self) -> &CameraConfig {
-        self.config.camera.as_ref().expect("validated: iterates and snapshots have a camera")
-    }
-
-    /// A clip measured by a simulated camera.
-    fn exercise(&self, settings: &SnapshotsConfig, seed: u64) -> Result<Exercise> {
-        let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
-        let [few, many] = self.camera().frames;
-        let frames = rng.random_range(few..=many);
-        let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
-        let measurement = camera::measure(clip.view(), CfaPattern::Rggb, self.camera(), &mut rng)?;
-        let exercise = Exercise::new(clip.view(), &measurement, settings.start_iterations)?;
-        Ok(Exercise { seed, end: settings.iterations, ..exercise })
-    }
-
-    /// Solves to go on with, each a lesson of its own as clips differ in length.
-    fn exercises(&mut self, settings: &SnapshotsConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
-        let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
-        let mut pool = std::mem::take(&mut self.pool);
-        let solves = pool.take(settings, &seeds, |seed| self.exercise(settings, seed));
-        self.pool = pool;
-        Ok(solves?.into_iter().map(|solve| Lesson::Exercise(Box::new(solve))).collect())
+        self.config.camera.as_ref().expect("validated: iterates have a camera")
     }
 
     /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves.
@@ -411,11 +348,10 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.rate * self.config.learning_rate(self.step);
-        let mut lessons = match (&self.config.iterates, &self.config.snapshots) {
-            (Some(iterates), _) => self.iterates(iterates, &mut rng)?,
-            (_, Some(snapshots)) => self.exercises(&snapshots.clone(), &mut rng)?,
-            _ => {
-                let noise = self.config.noise.clone().expect("validated: noise, iterates or snapshots");
+        let lessons = match &self.config.iterates {
+            Some(iterates) => self.iterates(iterates, &mut rng)?,
+            None => {
+                let noise = self.config.noise.clone().expect("validated: noise or iterates");
                 vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
             }
         };
@@ -425,11 +361,7 @@ impl Trainer {
         if self.config.training.optimizer == Optimizer::Muon && self.step.is_multiple_of(CENTRE_EVERY) {
             self.find_centres(&lessons[0])?;
         }
-        let Gradients { loss, of_vars } = self.gradients(&mut lessons)?;
-        self.pool.put_back(lessons.into_iter().filter_map(|lesson| match lesson {
-            Lesson::Exercise(solve) => Some(*solve),
-            _ => None,
-        }));
+        let Gradients { loss, of_vars } = self.gradients(&lessons)?;
         let diverged = Error::Diverged { step: self.step + 1, loss };
         if !loss.is_finite() {
             return Err(diverged);
@@ -496,14 +428,8 @@ impl Trainer {
                 let first = &calls[0];
                 drop(watched.network()?.forward(&tensor(first.input.clone())?, &[first.sigma])?);
             }
-            Lesson::Exercise(exercise) => drop(exercise.unfold(watched.unfolding()?, self.at_once())?),
         }
         Ok(watched)
-    }
-
-    /// Iterations of a solve that a step does.
-    fn at_once(&self) -> usize {
-        self.config.snapshots.as_ref().map_or(1, |snapshots| snapshots.at_once)
     }
 
     /// Lets channels that were idle for long begin anew, while there is time for them to learn.
@@ -517,11 +443,11 @@ impl Trainer {
     }
 
     /// The mean loss of the lessons, and its gradient.
-    fn gradients(&self, lessons: &mut [Lesson]) -> Result<Gradients> {
-        Ok(Gradients::mean(lessons.par_iter_mut().map(|lesson| self.gradient(lesson)).collect::<Result<_>>()?))
+    fn gradients(&self, lessons: &[Lesson]) -> Result<Gradients> {
+        Ok(Gradients::mean(lessons.par_iter().map(|lesson| self.gradient(lesson)).collect::<Result<_>>()?))
     }
 
-    fn gradient(&self, lesson: &mut Lesson) -> Result<Gradients> {
+    fn gradient(&self, lesson: &Lesson) -> Result<Gradients> {
         let loss = self.config.training.loss;
         match lesson {
             Lesson::Unrolled { measurement, clean, calls } => {
@@ -529,7 +455,6 @@ impl Trainer {
                 let recipe = self.config.iterates.as_ref().expect("these lessons come of iterates").recipe();
                 recipe.gradient(measurement, calls, self.model.network()?, &self.vars, &of_clean)
             }
-            Lesson::Exercise(exercise) => exercise.advance(self.model.unfolding()?, self.at_once(), &self.vars, loss),
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
                 let loss = loss.mean(&(self.model.network()?.forward(seen, sigmas)? - clean)?)?;
                 let mut found = Gradients::zero(self.vars.len());
@@ -584,9 +509,6 @@ impl Trainer {
                 .map(|sigma| self.score_reconstruction(&mut model, iterates, sigma))
                 .collect();
         }
-        if let Model::Unfolding(net) = &model {
-            return NOISE_LEVELS.into_iter().map(|sigma| self.score_solves(net, sigma)).collect();
-        }
         let settings = &self.config.validation;
         let mut scores = Vec::new();
         for &sigma in &settings.sigmas {
@@ -624,23 +546,6 @@ impl Trainer {
         Ok(Score { sigma, psnr_db: sum / f64::from(count) })
     }
 
-    /// PSNR of the solves of the middle of each held-out clip, without noise on the measurement or with that of a level in 0..255 units.
-    fn score_solves(&self, net: &UnfoldingNet, sigma: Option<f32>) -> Result<Score> {
-        let mut psnrs = Vec::new();
-        let settings = self.config.snapshots.as_ref();
-        let (start_iterations, iterations) = settings.map_or((0, 1), |s| (s.start_iterations, s.iterations));
-        for (i, clip) in self.data.validation.iter().enumerate() {
-            let mut rng = self.rng(VALIDATION_STREAM + i as u64);
-            let clean = cut(&centre(&to_video(clip, VALIDATION_FRAMES)), MULTIPLE);
-            let measurement = camera::plain(clean.view(), CfaPattern::Rggb, sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
-            let exercise = Exercise::new(clean.view(), &measurement, start_iterations)?;
-            let (results, _) = exercise.unfold(net, iterations)?;
-            let errors = results.last().map(|last| exercise.errors(last)).transpose()?.unwrap_or_default();
-            psnrs.extend(errors.into_iter().map(|error| -10.0 * f64::from(error).log10()));
-        }
-        Ok(Score { sigma, psnr_db: psnrs.iter().sum::<f64>() / psnrs.len() as f64 })
-    }
-
     /// The model with these weights, for inference: constants are packed for the kernels once, not at each call.
     fn frozen(&self, mut weights: BTreeMap<String, Tensor>) -> Model {
         let mut model = self.model.clone();
@@ -673,8 +578,7 @@ impl Trainer {
         for (weight, Centre { means, .. }) in self.adam.centres() {
             tensors.insert(format!("means/{}", self.vars[weight].0), Tensor::new(&**means, &Device::Cpu)?);
         }
-        let pool = self.pool.state(&mut tensors);
-        let meta = Meta::new(self.step, self.adam.steps(), self.config.clone(), pool, self.random, self.rate);
+        let meta = Meta::new(self.step, self.adam.steps(), self.config.clone(), self.random, self.rate);
         checkpoint::write(path, &meta, &tensors)
     }
 
@@ -738,12 +642,7 @@ impl Trainer {
             let Some(inputs) = self.adam.centred_inputs(weight) else { continue };
             centres.push((weight, Centre { bias, means: take("means", &self.vars[weight].0, &[inputs])? }));
         }
-        let pool = match &self.config.snapshots {
-            Some(snapshots) => Pool::restored(path, &meta.pool, &mut tensors, |seed| self.exercise(snapshots, seed))?,
-            None => Pool::default(),
-        };
         // Only now that all is there does anything change.
-        self.pool = pool;
         for ((_, var), weights) in self.vars.iter().zip(weights) {
             var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
         }

@@ -14,8 +14,7 @@ const BUNDLED: &[(&str, &[u8])] = bundled![
     "fastdvdnet_gray_sci",
     "ddnet",
     "fastdvdnet_color",
-    "fastdvdnet_color_sci",
-    "unfolding_gray"
+    "fastdvdnet_color_sci"
 ];
 
 /// The names that `bundled:NAME` knows.

@@ -9,7 +9,7 @@ mod stored;
 
 use crate::{
     Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, Shiftnet,
-    ShiftnetSpec, UnfoldingNet, UnfoldingSpec,
+    ShiftnetSpec,
 };
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
@@ -31,8 +31,6 @@ pub enum Architecture {
     Ddnet(DdnetSpec),
     /// ShiftNet, gray or color.
     Shiftnet(ShiftnetSpec),
-    /// The unfolding network, gray or color.
-    Unfolding(UnfoldingSpec),
 }
 
 impl std::fmt::Display for Architecture {
@@ -42,7 +40,6 @@ impl std::fmt::Display for Architecture {
             Self::Fastdvdnet(spec) => spec.fmt(f),
             Self::Ddnet(spec) => spec.fmt(f),
             Self::Shiftnet(spec) => spec.fmt(f),
-            Self::Unfolding(spec) => spec.fmt(f),
         }
     }
 }
@@ -129,9 +126,8 @@ impl WeightFile {
     /// # Errors
     /// [`Error::UnknownArchitecture`].
     pub fn architecture(&self) -> Result<Architecture> {
-        UnfoldingSpec::recognise(self)
-            .map(Architecture::Unfolding)
-            .or_else(|| ShiftnetSpec::recognise(self).map(Architecture::Shiftnet))
+        ShiftnetSpec::recognise(self)
+            .map(Architecture::Shiftnet)
             .or_else(|| FastdvdnetSpec::recognise(self).map(Architecture::Fastdvdnet))
             .or_else(|| DdnetSpec::recognise(self).map(Architecture::Ddnet))
             .or_else(|| FfdnetSpec::recognise(self).map(Architecture::Ffdnet))
@@ -180,7 +176,6 @@ pub fn network(file: WeightFile) -> Result<Box<dyn Layers>> {
         Architecture::Fastdvdnet(_) => Box::new(Fastdvdnet::from_weights(file, Ends::Circular)?),
         Architecture::Ddnet(_) => Box::new(Ddnet::from_weights(file, Ends::Circular)?),
         Architecture::Shiftnet(_) => Box::new(Shiftnet::from_weights(file)?),
-        Architecture::Unfolding(_) => Box::new(UnfoldingNet::from_weights(file)?),
     })
 }
 

@@ -18,7 +18,7 @@ use nets::unrolled::Recipe;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::parts::{Around, Chosen, Demosaicer, Misfit, first_of_all};
+use crate::parts::{Chosen, Demosaicer, first_of_all};
 use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
 
@@ -191,10 +191,7 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         json,
         written,
     };
-    experiment
-        .check_denoisers()
-        .and_then(|()| experiment.set_recipe())
-        .map_err(|Misfit { key, problem }| source.error_at(key, format!("`{key}` {problem}")))?;
+    experiment.set_recipe().map_err(|(key, problem)| source.error_at(key, format!("`{key}` {problem}")))?;
     experiment.begin_with_tv();
     Ok(experiment)
 }
@@ -226,23 +223,11 @@ impl Written {
 }
 
 impl Experiment {
-    /// Asks each denoiser about the rest.
-    fn check_denoisers(&self) -> Result<(), Misfit> {
-        self.denoisers.iter().enumerate().try_for_each(|(i, denoiser)| {
-            let stages: Vec<bool> = self.stages.iter().map(|stage| stage.denoiser == i).collect();
-            denoiser.part.check(&Around {
-                solver: self.solver.kind,
-                accelerated: self.solver.method.accelerated(),
-                normalised: matches!(self.solver.start, Start::Mean | Start::Tv { .. }),
-                stages: &stages,
-                online: self.online.is_some(),
-                tiles: self.skip.is_some_and(|s| s.tiles),
-            })
-        })
-    }
-
     /// For measurement splitting, the solve to learn through.
-    fn set_recipe(&mut self) -> Result<(), Misfit> {
+    ///
+    /// # Errors
+    /// The key that does not fit, and what is wrong with it.
+    fn set_recipe(&mut self) -> Result<(), (&'static str, String)> {
         if !self.online.is_some_and(|online| matches!(online.adapt.loss, AdaptLoss::Split(_))) {
             return Ok(());
         }
@@ -272,7 +257,7 @@ impl Experiment {
             (alone, "denoiser", format!("is another, {through} one ffdnet or fastdvdnet in all stages; legal: that")),
         ];
         if let Some((_, key, problem)) = rules.into_iter().find(|(holds, ..)| !holds) {
-            return Err(Misfit { key, problem });
+            return Err((key, problem));
         }
         let sigma = |stage: &Stage| std::iter::repeat_n(stage.sigma.unwrap_or(0.0), stage.iterations);
         self.recipe = accelerate.zip(start).map(|(accelerate, start)| Recipe {

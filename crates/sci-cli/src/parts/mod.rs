@@ -7,7 +7,6 @@ mod network;
 mod saving;
 mod shiftnet;
 mod tv;
-mod unfolding;
 mod wnnm;
 
 use std::fmt::Debug;
@@ -28,8 +27,7 @@ pub use saving::{MultiplyAdds, Saving, Work};
 pub use tv::first_of_all;
 
 /// Every denoiser.
-const DENOISERS: &[Entry] =
-    &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, shiftnet::ENTRY, unfolding::ENTRY];
+const DENOISERS: &[Entry] = &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, shiftnet::ENTRY];
 /// Those that are going to be.
 const NOT_YET: &[&str] = &["wavelet"];
 
@@ -84,45 +82,11 @@ pub trait Part: Debug + Send + Sync {
         false
     }
 
-    /// What the rest of an experiment must not be, if it is used there.
-    ///
-    /// # Errors
-    /// What does not fit it.
-    fn check(&self, _around: &Around<'_>) -> Result<(), Misfit> {
-        Ok(())
-    }
-
     /// What all measurements share of it, such as a loaded network.
     ///
     /// # Errors
     /// When a file cannot be read, or is not for such a sensor.
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>>;
-}
-
-/// The experiment around a denoiser.
-#[derive(Clone, Copy, Debug)]
-pub struct Around<'e> {
-    /// The solver's `kind`.
-    pub solver: &'e str,
-    /// Whether it is accelerated.
-    pub accelerated: bool,
-    /// Whether it starts from the mean, or from TV.
-    pub normalised: bool,
-    /// For each stage whether it is one of this denoiser.
-    pub stages: &'e [bool],
-    /// Whether networks adapt.
-    pub online: bool,
-    /// Whether tiles may be left out.
-    pub tiles: bool,
-}
-
-/// What does not fit a denoiser.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Misfit {
-    /// The key to change.
-    pub key: &'static str,
-    /// What is wrong with it.
-    pub problem: String,
 }
 
 /// Where a part is to work.

@@ -219,12 +219,8 @@ fn damaged_files_are_harmless() {
     check("experiment, gray", demo.as_bytes(), experiment);
     check("experiment, color", include_bytes!("../../../../configs/color/default.toml"), experiment);
     check("experiment that extends another", b"extends = 'b.toml'\n[denoiser]\nweight = 0.2\n", experiment);
-    let unfolding = b"[data]\npath = 'a'\n[solver]\nkind = 'gap'\naccelerate = false\n[denoiser]\nkind = 'unfolding'\n\
-                      weights = 'b'\n[[stage]]\niterations = 3\n";
-    check("experiment, unfolding", unfolding, experiment);
     check("training file", include_bytes!("../../../../configs/train/fastdvdnet_gray.toml"), is_training);
     check("training file, iterates", include_bytes!("../../../../configs/train/fastdvdnet_gray_sci.toml"), is_training);
-    check("training file, snapshots", include_bytes!("../../../../configs/train/unfolding_gray.toml"), is_training);
     check_within(json_budget, "record.json", include_bytes!("../../../../tests/fixtures/record.json"), is_record);
     damaged_scenes(&dir.path().join("scene"), &ramp);
     damaged_weights(dir.path());

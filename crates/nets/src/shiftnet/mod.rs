@@ -6,13 +6,17 @@
 //! ```
 //!
 //! # References
-//! Those of its body (`shift_unet`): Zhang, Zuo, Zhang, *FFDNet*, TIP 2018; Lin, Gan, Han, *TSM*, ICCV 2019; Qi et al., *Real-time streaming video
+//! Zhang, Zuo, Zhang, *FFDNet*, TIP 2018; Lin, Gan, Han, *TSM*, ICCV 2019; Qi et al., *Real-time streaming video
 //! denoising with bidirectional buffers*, ACM MM 2022.
+
+mod body;
+mod temporal_shift;
+
+use body::{Body, MULTIPLE, PHASES};
 
 use crate::infer::{Cache, channel_row, set_channel};
 use crate::layers::{Conv, Source};
 use crate::network::{Layers, Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
-use crate::shift_unet::{MULTIPLE, PHASES, UnetSpec};
 use crate::weights::{Architecture, WeightFile};
 use crate::{Error, Result};
 use admm::{BoxError, Call, Denoiser};
@@ -25,8 +29,6 @@ use std::path::Path;
 
 /// The middle of the range of frames, which is taken off what the network is shown.
 const GRAY: f32 = 0.5;
-/// What the names of all tensors begin with.
-const PREFIX: &str = "body.";
 
 /// The size of a [`Shiftnet`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -41,7 +43,7 @@ pub struct ShiftnetSpec {
 
 impl ShiftnetSpec {
     pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
-        let (outputs, widths, depth) = UnetSpec::recognise(file, PREFIX)?;
+        let (outputs, widths, depth) = Body::recognise(file)?;
         Some(Self { channels: outputs / PHASES, widths, depth })
     }
 
@@ -53,9 +55,9 @@ impl ShiftnetSpec {
         self.body().validate().map(|()| self)
     }
 
-    fn body(self) -> UnetSpec {
+    fn body(self) -> Body {
         let colors = PHASES * self.channels;
-        UnetSpec { ends: (colors + 1, colors), widths: self.widths, depth: self.depth }
+        Body { ends: (colors + 1, colors), widths: self.widths, depth: self.depth }
     }
 }
 
@@ -114,7 +116,7 @@ impl Shiftnet {
     }
 
     fn build(spec: ShiftnetSpec, source: &mut Source<'_>) -> Result<Self> {
-        Ok(Self { spec, convs: spec.body().build(source, PREFIX)?, cache: Cache::default() })
+        Ok(Self { spec, convs: spec.body().build(source)?, cache: Cache::default() })
     }
 
     /// Its size.
@@ -128,7 +130,7 @@ impl Shiftnet {
         let half = |n: usize| n.next_multiple_of(MULTIPLE) / 2;
         let (half_h, half_w) = (half(height), half(width));
         let body = self.spec.body();
-        let (shuffled, plain) = body.results(1);
+        let (shuffled, plain) = body.results();
         let convs: Vec<&Conv> = self.convs.iter().collect();
         let engine = self.cache.engine(&convs, &shuffled, &plain)?;
         engine.start(half_h, half_w);
@@ -146,7 +148,7 @@ impl Shiftnet {
             features.push(engine.conv(0, &shown)?);
             engine.recycle(shown);
         }
-        let features = body.between(engine, 0, features)?;
+        let features = body.between(engine, features)?;
         for ((features, frame), mut out) in features.into_iter().zip(clip.outer_iter()).zip(out.outer_iter_mut()) {
             let found = engine.conv(convs.len() - 1, &features)?;
             engine.recycle(features);
@@ -197,7 +199,7 @@ impl Network for Shiftnet {
         let (n, _, h, w) = check_clips(self, clips, noise)?;
         let x = pixel_unshuffle(&Padding::Reflect.pad(clips, MULTIPLE)?, 2)?;
         let shown = Tensor::cat(&[&(&x - f64::from(GRAY))?, &noise_map(n, noise, &x)?], 1)?;
-        let (found, _) = self.spec.body().forward(&self.convs, &shown, None, n / noise.len())?;
+        let found = self.spec.body().forward(&self.convs, &shown, n / noise.len())?;
         Ok(crop(&pixel_shuffle(&(x + found)?, 2)?, h, w)?)
     }
 }

@@ -1,7 +1,9 @@
 //! Time for free: some channels of each frame are those of its neighbours.
 
-use super::SHIFTED;
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor, WithDType};
+
+/// One of so many channels is taken from the frame before, and one from the frame after.
+const SHIFTED: usize = 4;
 
 /// Of images `[N, C, H, W]`, clips of equal length one after another, each in order of time: the first channels of each from the frame before, as many from the frame after, the others
 /// its own. Zeros beyond the ends of a clip.

@@ -1,4 +1,4 @@
-//! The body that networks of ours share: small, U-shaped, for whole clips.
+//! The layers of ShiftNet: a small U-shaped network for whole clips.
 //!
 //! Everything is at half the size, each 2×2 pixels as channels (the *phases* of an image), a quarter and an eighth. Frames are
 //! mixed at no cost: in each residual block a share of the channels is taken from the frame before, and as much from the frame after
@@ -8,10 +8,7 @@
 //! Zhang, Zuo, Zhang, *FFDNet*, TIP 2018 (half size by pixels as channels); Lin, Gan, Han, *TSM: temporal shift module*, ICCV 2019; Qi et al.,
 //! *Real-time streaming video denoising with bidirectional buffers*, ACM MM 2022 (the shift in video restoration).
 
-mod temporal_shift;
-
-use temporal_shift::TemporalShift;
-
+use super::temporal_shift::TemporalShift;
 use crate::infer::Engine;
 use crate::kernels::{Blocked, Conv3x3, LANES};
 use crate::layers::{Conv, Shift, Source, chain};
@@ -25,14 +22,14 @@ use rayon::prelude::*;
 const LEVELS: usize = 3;
 /// Sides of an image are continued to a multiple of this.
 pub(crate) const MULTIPLE: usize = 2 << (LEVELS - 1);
-/// One of so many channels is taken from the frame before, and one from the frame after.
-const SHIFTED: usize = 4;
+/// What the names of all tensors begin with.
+const PREFIX: &str = "body.";
 /// Phases of an image of one channel.
 pub(crate) const PHASES: usize = 4;
 
-/// The size of a body.
+/// Its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(crate) struct UnetSpec {
+pub(crate) struct Body {
     /// Channels that it is shown at half the size, and those that it finds.
     pub(crate) ends: (usize, usize),
     /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
@@ -41,12 +38,12 @@ pub(crate) struct UnetSpec {
     pub(crate) depth: usize,
 }
 
-impl UnetSpec {
-    /// Channels found, widths and depth of the body whose tensors begin with `prefix`.
-    pub(crate) fn recognise(file: &WeightFile, prefix: &str) -> Option<(usize, [usize; LEVELS], usize)> {
-        let outputs = |name: &str| file.shape(&format!("{prefix}{name}.weight"))?.first().copied();
+impl Body {
+    /// Channels found, widths and depth by the tensors of a file.
+    pub(crate) fn recognise(file: &WeightFile) -> Option<(usize, [usize; LEVELS], usize)> {
+        let outputs = |name: &str| file.shape(&format!("{PREFIX}{name}.weight"))?.first().copied();
         let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
-        let blocks = (0..).take_while(|b| file.shape(&format!("{prefix}block{b}.0.weight")).is_some()).count();
+        let blocks = (0..).take_while(|b| file.shape(&format!("{PREFIX}block{b}.0.weight")).is_some()).count();
         Some((outputs("output")?, widths, blocks.checked_sub(2 * (LEVELS - 1))?))
     }
 
@@ -111,12 +108,12 @@ impl UnetSpec {
         sum
     }
 
-    /// The layers, their tensors under names that begin with `prefix`.
-    pub(crate) fn build(self, source: &mut Source<'_>, prefix: &str) -> Result<Vec<Conv>> {
+    /// The layers.
+    pub(crate) fn build(self, source: &mut Source<'_>) -> Result<Vec<Conv>> {
         let layer = |LayerSpec { name, inputs, outputs, stride, relu, bias, .. }| {
             let opts = Conv3x3 { stride, relu, ..Conv3x3::default() };
             let shift = if bias { Shift::Bias } else { Shift::Nothing };
-            Conv::new(source, format!("{prefix}{name}"), (inputs, outputs), opts, shift)
+            Conv::new(source, format!("{PREFIX}{name}"), (inputs, outputs), opts, shift)
         };
         self.layers().into_iter().map(layer).collect()
     }
@@ -129,35 +126,23 @@ impl UnetSpec {
         Ok(())
     }
 
-    /// Which layers' results are shuffled, and which are held in f32: all but those inside residual blocks; of an engine of so many
-    /// bodies.
-    pub(crate) fn results(self, bodies: usize) -> (Vec<usize>, Vec<usize>) {
-        let layers: Vec<LayerSpec> = (0..bodies).flat_map(|_| self.layers()).collect();
+    /// Which layers' results are shuffled, and which are held in f32: all but those inside residual blocks.
+    pub(crate) fn results(self) -> (Vec<usize>, Vec<usize>) {
+        let layers = self.layers();
         let which = |wanted: fn(&LayerSpec) -> bool| {
             layers.iter().enumerate().filter(|(_, layer)| wanted(layer)).map(|(i, _)| i).collect()
         };
         (which(|layer| layer.name.starts_with("up")), which(|layer| !(layer.relu && layer.stride == 1)))
     }
 
-    /// Differentiable: of images `[N, shown, H/2, W/2]`, clips of `frames` frames one after another, what is found and the features
-    /// before the last layer. `features` are added to those after the first.
-    pub(crate) fn forward(
-        self,
-        convs: &[Conv],
-        shown: &Tensor,
-        features: Option<Tensor>,
-        frames: usize,
-    ) -> candle_core::Result<(Tensor, Tensor)> {
+    /// Differentiable: of images `[N, shown, H/2, W/2]`, clips of `frames` frames one after another, what is found.
+    pub(crate) fn forward(self, convs: &[Conv], shown: &Tensor, frames: usize) -> candle_core::Result<Tensor> {
         let mut next = 0;
         let mut layers = |count: usize| {
             next += count;
             &convs[next - count..next]
         };
-        let h = chain(layers(1), &[], shown)?;
-        let mut h = match features {
-            Some(features) => (features + h)?,
-            None => h,
-        };
+        let mut h = chain(layers(1), &[], shown)?;
         let mut above = Vec::new();
         for step in self.steps() {
             h = match step {
@@ -179,12 +164,12 @@ impl UnetSpec {
                 }
             };
         }
-        Ok((chain(layers(1), &[], &h)?, h))
+        chain(layers(1), &[], &h)
     }
 
-    /// Without gradients: all but the first and the last layer, from the layer `first` of the engine on, for the features of all frames.
-    pub(crate) fn between(self, engine: &mut Engine, first: usize, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
-        let mut next = first + 1;
+    /// Without gradients: all but the first and the last layer, for the features of all frames.
+    pub(crate) fn between(self, engine: &mut Engine, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
+        let mut next = 1;
         let mut above: Vec<Vec<Blocked>> = Vec::new();
         for step in self.steps() {
             match step {
@@ -290,15 +275,6 @@ fn sum(image: &mut Blocked, a: &Blocked, b: &Blocked) {
         image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
             let both = a.row(block, y).iter().zip(b.row(block, y));
             row.as_flattened_mut().iter_mut().zip(both).for_each(|(sum, (a, b))| *sum = a + b);
-        });
-    }
-}
-
-/// `image += other`.
-pub(crate) fn add(image: &mut Blocked, other: &Blocked) {
-    for block in 0..image.blocks() {
-        image.par_rows_mut(block).enumerate().for_each(|(y, row)| {
-            row.as_flattened_mut().iter_mut().zip(other.row(block, y)).for_each(|(sum, value)| *sum += value);
         });
     }
 }
