@@ -14,8 +14,9 @@ use crate::fastdvdnet::{check_widths, recognise_blocks};
 use crate::layers::{Conv, Source};
 use crate::network::{Layers, Network, Padding, Window, check_clips, copy_to, reflect, to_tensor};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
-use crate::weights::{Architecture, WeightFile};
-use crate::{Error, Result};
+use crate::weights::WeightFile;
+use crate::{Architecture, Error, Result};
+use admm::Call;
 use candle_core::Tensor;
 use ndarray::{Array4, ArrayView3, ArrayView4, ArrayViewMut4, s};
 use rand::SeedableRng;
@@ -100,7 +101,7 @@ impl Ddnet {
     }
 
     /// The RGB video of sparse RGGB frames, both `[T, 3, H, W]`.
-    pub(crate) fn infer(&mut self, sparse: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<()> {
+    fn fill_in(&mut self, sparse: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<()> {
         let device = self.device();
         if device.is_cpu() {
             return self.net.infer(sparse, 0.0, out);
@@ -176,6 +177,19 @@ impl Network for Ddnet {
     fn padded(&self, clip: &Tensor) -> Result<Tensor> {
         Ok(Padding::Reflect.pad(clip, 4)?)
     }
+
+    /// Frames of a mosaic; no σ is looked at.
+    fn infer(&mut self, _: &Call<'_>, clip: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<(), BoxError> {
+        Ok(self.fill_in(clip, out)?)
+    }
+
+    fn sees_mosaics(&self) -> bool {
+        true
+    }
+
+    fn boxed(&self) -> Box<dyn Network> {
+        Box::new(self.clone())
+    }
 }
 
 impl Demosaicer for Ddnet {
@@ -199,10 +213,10 @@ impl Demosaicer for Ddnet {
         }
         let sparse = sparse_rgb(cfa, mosaic);
         if sparse.dim() == rgb.dim() {
-            return Ok(self.infer(sparse.view(), rgb)?);
+            return Ok(self.fill_in(sparse.view(), rgb)?);
         }
         let mut whole = Array4::zeros(sparse.dim());
-        self.infer(sparse.view(), whole.view_mut())?;
+        self.fill_in(sparse.view(), whole.view_mut())?;
         let (top, left) = shift(cfa);
         rgb.assign(&whole.slice(s![.., .., top.., left..]));
         Ok(())

@@ -1,6 +1,6 @@
 //! What can go wrong in this crate.
 
-use crate::weights::Architecture;
+use crate::Architecture;
 use candle_core::DType;
 use std::path::{Path, PathBuf};
 

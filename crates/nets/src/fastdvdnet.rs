@@ -10,8 +10,8 @@
 use crate::layers::{Conv, Source};
 use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, to_tensor};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
-use crate::weights::{Architecture, WeightFile};
-use crate::{Error, Result};
+use crate::weights::WeightFile;
+use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use ndarray::{ArrayView4, ArrayViewMut4};
@@ -194,6 +194,19 @@ impl Network for Fastdvdnet {
 
     fn padded(&self, clip: &Tensor) -> Result<Tensor> {
         Ok(Padding::Reflect.pad(clip, 4)?)
+    }
+
+    fn infer(
+        &mut self,
+        call: &Call<'_>,
+        clip: ArrayView4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        self.denoise(call, clip, out)
+    }
+
+    fn boxed(&self) -> Box<dyn Network> {
+        Box::new(self.clone())
     }
 }
 

@@ -16,8 +16,8 @@ use crate::infer::{Cache, channel_row, set_channel};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
-use crate::weights::{Architecture, WeightFile};
-use crate::{Error, Result};
+use crate::weights::WeightFile;
+use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
@@ -178,7 +178,7 @@ impl Ffdnet {
     }
 
     /// One frame `[C, H, W]` without a tensor in the loop.
-    fn infer(&mut self, frame: ArrayView3<'_, f32>, sigma: f32, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+    fn infer_frame(&mut self, frame: ArrayView3<'_, f32>, sigma: f32, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
         let (c, h, w) = frame.dim();
         let (half_h, half_w) = (h.div_ceil(2), w.div_ceil(2));
@@ -274,6 +274,19 @@ impl Network for Ffdnet {
     fn reach(&self) -> Option<usize> {
         Some(2 * self.spec.depth + 2)
     }
+
+    fn infer(
+        &mut self,
+        call: &Call<'_>,
+        clip: ArrayView4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        self.denoise(call, clip, out)
+    }
+
+    fn boxed(&self) -> Box<dyn Network> {
+        Box::new(self.clone())
+    }
 }
 
 impl Denoiser for Ffdnet {
@@ -295,7 +308,7 @@ impl Denoiser for Ffdnet {
         let device = self.device();
         for (frame, out) in noisy.outer_iter().zip(out.outer_iter_mut()) {
             if device.is_cpu() {
-                self.infer(frame, sigma, out)?;
+                self.infer_frame(frame, sigma, out)?;
             } else {
                 let clean = self.forward(&to_tensor(frame.insert_axis(Axis(0)), &device)?, &[sigma])?;
                 copy_to(&clean, out.insert_axis(Axis(0))).map_err(Error::from)?;

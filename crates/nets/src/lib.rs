@@ -14,6 +14,7 @@
 //! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
 //! ```
 
+mod architecture;
 mod ddnet;
 mod error;
 mod fastdvdnet;
@@ -31,6 +32,7 @@ pub mod unrolled;
 mod video;
 pub mod weights;
 
+pub use architecture::Architecture;
 pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};
 pub use fastdvdnet::{Fastdvdnet, FastdvdnetSpec};

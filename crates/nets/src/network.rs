@@ -3,6 +3,7 @@
 use crate::kernels::Precision;
 use crate::layers::{Conv, Parameters};
 use crate::{Error, KeyReport};
+use admm::{BoxError, Call};
 use candle_core::{Device, Tensor, Var};
 use ndarray::{ArrayView4, ArrayViewMut4, Axis};
 use std::collections::BTreeMap;
@@ -165,6 +166,25 @@ pub trait Network: Layers {
     /// [`Error::Channels`], [`Error::Shape`] when `N` is not a multiple of `noise.len()` or a frame is empty,
     /// [`Error::Sigma`].
     fn forward(&self, clips: &Tensor, noise: &[f32]) -> Result<Tensor, Error>;
+
+    /// [`Network::forward`] of one clip `[T, C, H, W]` without gradients, for solves.
+    ///
+    /// # Errors
+    /// As [`Network::forward`], and when the call has no σ for a network that is told one.
+    fn infer(
+        &mut self,
+        call: &Call<'_>,
+        clip: ArrayView4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError>;
+
+    /// Whether it fills in a mosaic, and is given frames with what an RGGB sensor sees of them, zeros elsewhere.
+    fn sees_mosaics(&self) -> bool {
+        false
+    }
+
+    /// A copy.
+    fn boxed(&self) -> Box<dyn Network>;
 
     /// [`Network::forward`] of one clip taken apart, so that its gradient can be had with the memory of one window:
     /// for each stage the windows, in the order of their outputs, for a clip of `frames` frames.

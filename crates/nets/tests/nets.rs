@@ -4,9 +4,9 @@ use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor};
 use ndarray::{Array3, Array4, Axis, concatenate, s};
 use nets::kernels::{Isa, Precision};
-use nets::weights::{Architecture, Storage, convert, write_safetensors};
+use nets::weights::{Storage, convert, write_safetensors};
 use nets::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers,
+    Architecture, Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers,
     MixedPrecision, Network, Shiftnet, WeightFile,
 };
 use sci_forward::bayer::{Malvar, mosaic_into};
@@ -311,7 +311,7 @@ fn weights_survive_a_file_and_are_recognised() {
         write_safetensors(&path, &net.state(), Storage::F32).unwrap();
         let file = WeightFile::read(&path).unwrap();
         assert_eq!(file.architecture().unwrap(), architecture);
-        let read = nets::weights::network(file).unwrap();
+        let read = Architecture::load(file, Ends::Circular).unwrap();
         let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         for ((name, a), (other, b)) in net.state().iter().zip(&read.state()) {
             assert_eq!((name, values(a)), (other, values(b)));

@@ -439,7 +439,7 @@ fn exported_weights_load_as_the_network() {
     let path = folder.path().join("weights.safetensors");
     let trainer = trainer(&config(FASTDVDNET, 3, 1));
     trainer.export(&path, nets::weights::Storage::F32).unwrap();
-    let read = nets::weights::network(WeightFile::read(&path).unwrap()).unwrap();
+    let read = nets::Architecture::load(WeightFile::read(&path).unwrap(), nets::Ends::Circular).unwrap();
     assert_eq!(read.describe(), trainer.describe());
 }
 

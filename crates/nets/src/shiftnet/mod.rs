@@ -17,8 +17,8 @@ use body::{Body, MULTIPLE, PHASES};
 use crate::infer::{Cache, channel_row, set_channel};
 use crate::layers::{Conv, Source};
 use crate::network::{Layers, Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
-use crate::weights::{Architecture, WeightFile};
-use crate::{Error, Result};
+use crate::weights::WeightFile;
+use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
@@ -125,7 +125,7 @@ impl Shiftnet {
     }
 
     /// A clip `[T, C, H, W]` without a tensor in the loop; arguments have been checked.
-    fn infer(&mut self, clip: ArrayView4<'_, f32>, sigma: f32, mut out: ArrayViewMut4<'_, f32>) -> Result<()> {
+    fn infer_clip(&mut self, clip: ArrayView4<'_, f32>, sigma: f32, mut out: ArrayViewMut4<'_, f32>) -> Result<()> {
         let (_, channels, height, width) = clip.dim();
         let half = |n: usize| n.next_multiple_of(MULTIPLE) / 2;
         let (half_h, half_w) = (half(height), half(width));
@@ -202,6 +202,19 @@ impl Network for Shiftnet {
         let found = self.spec.body().forward(&self.convs, &shown, n / noise.len())?;
         Ok(crop(&pixel_shuffle(&(x + found)?, 2)?, h, w)?)
     }
+
+    fn infer(
+        &mut self,
+        call: &Call<'_>,
+        clip: ArrayView4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        self.denoise(call, clip, out)
+    }
+
+    fn boxed(&self) -> Box<dyn Network> {
+        Box::new(self.clone())
+    }
 }
 
 impl Denoiser for Shiftnet {
@@ -222,7 +235,7 @@ impl Denoiser for Shiftnet {
         }
         let device = self.device();
         if device.is_cpu() {
-            self.infer(noisy, sigma, out)?;
+            self.infer_clip(noisy, sigma, out)?;
         } else {
             let clean = self.forward(&to_tensor(noisy, &device)?, &[sigma])?;
             copy_to(&clean, out).map_err(Error::from)?;

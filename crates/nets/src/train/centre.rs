@@ -139,8 +139,7 @@ pub(super) fn hold_open(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::NetworkConfig;
-    use crate::{Ffdnet, Layers};
+    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers};
 
     #[test]
     fn the_gradient_around_the_mean_is_that_of_a_layer_without_one() {
@@ -167,7 +166,11 @@ mod tests {
 
     #[test]
     fn only_what_is_nearly_shut_is_raised() {
-        let mut net = Ffdnet::random(NetworkConfig::ffdnet(1, 6, 4), 1).unwrap();
+        let mut net = Ffdnet::random(
+            FfdnetSpec { channels: 1, width: 6, depth: 4, layout: FfdnetLayout::Residual { batch_norm: false } },
+            1,
+        )
+        .unwrap();
         let vars = net.make_trainable().unwrap();
         let convs = net.convs();
         let var = |name: String| &vars.iter().find(|(var, _)| *var == name).unwrap().1;

@@ -1,9 +1,8 @@
 //! What a training run is: a plain, checked description that a TOML file maps to one to one.
 
-use crate::fastdvdnet::check_widths;
 use crate::kernels::Precision;
 use crate::video::Ends;
-use crate::{DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec};
+use crate::{Architecture, DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec};
 use candle_core::Tensor;
 use ndarray::Array4;
 use serde::{Deserialize, Serialize};
@@ -93,43 +92,42 @@ pub enum NetworkConfig {
 impl NetworkConfig {
     /// Colors of a frame: 1 or 3.
     pub fn channels(&self) -> usize {
+        match self.architecture().0 {
+            Architecture::Ffdnet(FfdnetSpec { channels, .. })
+            | Architecture::Fastdvdnet(FastdvdnetSpec { channels, .. })
+            | Architecture::Shiftnet(ShiftnetSpec { channels, .. }) => channels,
+            Architecture::Ddnet(_) => 3,
+        }
+    }
+
+    /// The network, and the neighbours of its end frames.
+    pub(super) fn architecture(&self) -> (Architecture, Ends) {
+        let residual = FfdnetLayout::Residual { batch_norm: false };
         match *self {
-            Self::Ffdnet { channels, .. } | Self::Fastdvdnet { channels, .. } | Self::Shiftnet { channels, .. } => {
-                channels
+            Self::Ffdnet { channels, width, depth } => {
+                (Architecture::Ffdnet(FfdnetSpec { channels, width, depth, layout: residual }), Ends::default())
             }
-            Self::Ddnet { .. } => 3,
+            Self::Fastdvdnet { channels, widths, ends } => {
+                (Architecture::Fastdvdnet(FastdvdnetSpec { channels, widths, batch_norm: false }), ends)
+            }
+            Self::Ddnet { widths, ends } => (Architecture::Ddnet(DdnetSpec { widths }), ends),
+            Self::Shiftnet { channels, widths, depth } => {
+                (Architecture::Shiftnet(ShiftnetSpec { channels, widths, depth }), Ends::default())
+            }
         }
     }
 
     /// Checks the network's size.
     fn validate(&self) -> Result<()> {
-        let checked = match *self {
-            Self::Ffdnet { channels, width, depth } => Self::ffdnet(channels, width, depth).validate().map(drop),
-            Self::Fastdvdnet { channels, widths, .. } => Self::fastdvdnet(channels, widths).block().map(drop),
-            Self::Ddnet { widths, .. } => check_widths(widths),
-            Self::Shiftnet { channels, widths, depth } => ShiftnetSpec { channels, widths, depth }.validate().map(drop),
-        };
         // The network knows its keys, not the table that they are in.
         const KEYS: [&str; 4] = ["network.channels", "network.width", "network.widths", "network.depth"];
-        checked.map_err(|error| match error {
+        self.architecture().0.validate().map_err(|error| match error {
             Error::Setting { key, value, legal } => {
                 let key = KEYS.into_iter().find(|known| known.ends_with(&format!(".{key}"))).unwrap_or(key);
                 Error::Setting { key, value, legal }
             }
             other => other,
         })
-    }
-
-    pub(super) fn ffdnet(channels: usize, width: usize, depth: usize) -> FfdnetSpec {
-        FfdnetSpec { channels, width, depth, layout: FfdnetLayout::Residual { batch_norm: false } }
-    }
-
-    pub(super) fn fastdvdnet(channels: usize, widths: [usize; 3]) -> FastdvdnetSpec {
-        FastdvdnetSpec { channels, widths, batch_norm: false }
-    }
-
-    pub(super) fn ddnet(widths: [usize; 3]) -> DdnetSpec {
-        DdnetSpec { widths }
     }
 }
 

@@ -151,7 +151,7 @@ fn replace(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Ffdnet, Layers, Network};
+    use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network};
     use candle_core::{Device, Var};
     use rand::SeedableRng;
 
@@ -166,7 +166,8 @@ mod tests {
 
     impl Trial {
         fn new() -> Self {
-            let spec = crate::train::NetworkConfig::ffdnet(1, 6, 5);
+            let spec =
+                FfdnetSpec { channels: 1, width: 6, depth: 5, layout: FfdnetLayout::Residual { batch_norm: false } };
             let mut net = Ffdnet::random(spec, 1).unwrap();
             let vars = net.make_trainable().unwrap();
             let convs = net.convs();

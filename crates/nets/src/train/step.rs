@@ -4,14 +4,14 @@ use super::adam::Adam;
 use super::camera;
 use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
-use super::config::{CameraConfig, IteratesConfig, NetworkConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
+use super::config::{CameraConfig, IteratesConfig, NoiseConfig, Optimizer, TrainConfig, TrainingConfig};
 use super::data::{TrainData, to_video};
 use super::noise::{add_noise, sensor};
 use super::revive::{Idle, State};
 use crate::layers::Conv;
 use crate::unrolled::{Gradients, RecordedCall, tensor};
 use crate::weights::{Storage, write_safetensors};
-use crate::{Ddnet, Error, Fastdvdnet, Ffdnet, Layers, Network, Result, Shiftnet, ShiftnetSpec};
+use crate::{Error, Network, Result};
 use admm::{Call, Denoiser};
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
@@ -56,73 +56,8 @@ pub struct Resumed {
     pub refused: Option<Error>,
 }
 
-/// The network that is trained.
-#[derive(Clone)]
-enum Model {
-    Ffdnet(Ffdnet),
-    Fastdvdnet(Fastdvdnet),
-    Ddnet(Ddnet),
-    Shiftnet(Shiftnet),
-}
-
-impl Model {
-    fn random(config: &NetworkConfig, seed: u64) -> Result<Self> {
-        Ok(match *config {
-            NetworkConfig::Ffdnet { channels, width, depth } => {
-                Self::Ffdnet(Ffdnet::random(NetworkConfig::ffdnet(channels, width, depth), seed)?)
-            }
-            NetworkConfig::Fastdvdnet { channels, widths, ends } => {
-                Self::Fastdvdnet(Fastdvdnet::random(NetworkConfig::fastdvdnet(channels, widths), ends, seed)?)
-            }
-            NetworkConfig::Ddnet { widths, ends } => {
-                Self::Ddnet(Ddnet::random(NetworkConfig::ddnet(widths), ends, seed)?)
-            }
-            NetworkConfig::Shiftnet { channels, widths, depth } => {
-                Self::Shiftnet(Shiftnet::random(ShiftnetSpec { channels, widths, depth }, seed)?)
-            }
-        })
-    }
-
-    fn layers(&self) -> &dyn Layers {
-        match self {
-            Self::Ffdnet(net) => net,
-            Self::Fastdvdnet(net) => net,
-            Self::Ddnet(net) => net,
-            Self::Shiftnet(net) => net,
-        }
-    }
-
-    fn layers_mut(&mut self) -> &mut dyn Layers {
-        match self {
-            Self::Ffdnet(net) => net,
-            Self::Fastdvdnet(net) => net,
-            Self::Ddnet(net) => net,
-            Self::Shiftnet(net) => net,
-        }
-    }
-
-    /// The network of frames.
-    fn network(&self) -> Result<&dyn Network> {
-        match self {
-            Self::Ffdnet(net) => Ok(net),
-            Self::Fastdvdnet(net) => Ok(net),
-            Self::Ddnet(net) => Ok(net),
-            Self::Shiftnet(net) => Ok(net),
-        }
-    }
-
-    /// The input of the network for noisy frames.
-    fn input(&self, noisy: Array4<f32>) -> Array4<f32> {
-        if matches!(self, Self::Ddnet(_)) { sensor(noisy.view()) } else { noisy }
-    }
-
-    /// Runs the network without gradients.
-    fn restore(&mut self, input: ArrayView4<'_, f32>, sigma: f32) -> Result<Array4<f32>> {
-        let mut out = Array4::zeros(input.dim());
-        self.denoise(&Call::new(sigma), input, out.view_mut()).map_err(|e| Error::Data(e.to_string()))?;
-        Ok(out)
-    }
-}
+/// A network as the denoiser of a solve.
+struct Solving<'n>(&'n mut dyn Network);
 
 /// Clean clips, what the network sees of them (both `[clips · T, C, P, P]`), σ of each.
 struct Batch {
@@ -162,7 +97,7 @@ enum Lesson {
 pub struct Trainer {
     config: TrainConfig,
     data: TrainData,
-    model: Model,
+    model: Box<dyn Network>,
     vars: Vec<(String, Var)>,
     adam: Adam,
     average: Vec<Vec<f32>>,
@@ -192,9 +127,9 @@ const VALIDATION_SIDE: usize = 256;
 /// Noise on measurements that are solved to validate, in 0..255 units.
 const NOISE_LEVELS: [Option<f32>; 2] = [None, Some(25.0)];
 
-impl Denoiser for Model {
+impl Denoiser for Solving<'_> {
     fn name(&self) -> &str {
-        "model"
+        "network"
     }
 
     fn denoise(
@@ -203,12 +138,7 @@ impl Denoiser for Model {
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), admm::BoxError> {
-        match self {
-            Self::Ffdnet(net) => net.denoise(call, noisy, out),
-            Self::Fastdvdnet(net) => net.denoise(call, noisy, out),
-            Self::Ddnet(net) => Ok(net.infer(noisy, out)?),
-            Self::Shiftnet(net) => net.denoise(call, noisy, out),
-        }
+        self.0.infer(call, noisy, out)
     }
 }
 
@@ -220,13 +150,14 @@ impl Trainer {
     pub fn new(config: TrainConfig, data: TrainData) -> Result<Self> {
         config.validate()?;
         data.check(config.network.channels(), config.data.photo_share)?;
-        let mut model = Model::random(&config.network, config.seed)?;
-        model.layers_mut().set_precision(config.training.precision);
-        let vars = model.layers_mut().make_trainable()?;
+        let (architecture, ends) = config.network.architecture();
+        let mut model = architecture.random(ends, config.seed)?;
+        model.set_precision(config.training.precision);
+        let vars = model.make_trainable()?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
         let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
-        let idle = Idle::new(&model.layers().convs(), &vars);
+        let idle = Idle::new(&model.convs(), &vars);
         Ok(Self { config, data, model, vars, adam, average, idle, random: true, rate: 1.0, step: 0 })
     }
 
@@ -235,16 +166,16 @@ impl Trainer {
     /// # Errors
     /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
     pub fn start_from(&mut self, weights: &BTreeMap<String, Tensor>) -> Result<()> {
-        let random = self.model.layers().state();
+        let random = self.model.state();
         if let Some(part) = self.config.renew.iter().find(|part| !random.keys().any(|name| name.contains(&***part))) {
             let legal = "parts of the names of the network's layers".to_owned();
             return Err(Error::Setting { key: "renew", value: part.clone(), legal });
         }
-        self.model.layers_mut().set_state(weights)?;
+        self.model.set_state(weights)?;
         let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
-        let state = self.model.layers().state().into_iter().chain(renewed).collect();
-        self.model.layers_mut().set_state(&state)?;
-        self.vars = self.model.layers_mut().make_trainable()?;
+        let state = self.model.state().into_iter().chain(renewed).collect();
+        self.model.set_state(&state)?;
+        self.vars = self.model.make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
         self.random = false;
@@ -258,12 +189,12 @@ impl Trainer {
 
     /// What is trained, with its size.
     pub fn describe(&self) -> String {
-        self.model.layers().describe()
+        self.model.describe()
     }
 
     /// Number of trained values.
     pub fn parameter_count(&self) -> usize {
-        self.model.layers().parameter_count()
+        self.model.parameter_count()
     }
 
     /// The share of the learning rate of the settings that is left after divergences, 1 without any.
@@ -298,11 +229,16 @@ impl Trainer {
             let sigma = low + (high - low) * rng.random::<f32>();
             let mut noisy = clip.clone();
             add_noise(&mut noisy, sigma, rng);
-            seen.push(self.model.input(noisy));
+            seen.push(self.seen(noisy));
             clean.push(clip);
             sigmas.push(sigma);
         }
         Ok(Batch { clean: stack(&clean)?, seen: stack(&seen)?, sigmas })
+    }
+
+    /// What the network is shown of noisy frames.
+    fn seen(&self, noisy: Array4<f32>) -> Array4<f32> {
+        if self.model.sees_mosaics() { sensor(noisy.view()) } else { noisy }
     }
 
     /// Iterates of the solver with the network as it is, each a lesson of its own as clips differ in length; with
@@ -310,7 +246,7 @@ impl Trainer {
     fn iterates(&self, settings: &IteratesConfig, rng: &mut ChaCha8Rng) -> Result<Vec<Lesson>> {
         let now = self.vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor()));
         let mut model = self.frozen(now.collect());
-        model.layers_mut().set_inference_precision(self.config.training.precision);
+        model.set_inference_precision(self.config.training.precision);
         let seeds: Vec<u64> = (0..self.config.data.batch).map(|_| rng.random()).collect();
         let clip = |seed: u64| {
             let (data, mut rng) = (&self.config.data, ChaCha8Rng::seed_from_u64(seed));
@@ -319,7 +255,7 @@ impl Trainer {
             let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
             let pattern = CfaPattern::ALL[rng.random_range(0..4)];
             let measurement = camera::measure(clip.view(), pattern, self.camera(), &mut rng)?;
-            let calls = settings.record(&measurement, &mut model.clone(), &mut rng)?;
+            let calls = settings.record(&measurement, &mut Solving(&mut *model.boxed()), &mut rng)?;
             if settings.unrolled {
                 return Ok(vec![Lesson::Unrolled { measurement: Box::new(measurement), clean: clip, calls }]);
             }
@@ -385,7 +321,7 @@ impl Trainer {
             }
             let renewed = !self.random;
             let watched = self.watched(lesson)?;
-            let conv = watched.layers().convs()[i];
+            let conv = watched.convs()[i];
             let Some(means) = conv.input_means() else { continue };
             open(conv, means, self.variables(weight, bias), renewed)?;
         }
@@ -396,7 +332,7 @@ impl Trainer {
     /// What each layer is given on average, from what a lesson begins with, and what follows from it.
     fn find_centres(&mut self, lesson: &Lesson) -> Result<()> {
         let watched = self.watched(lesson)?;
-        let convs = watched.layers().convs();
+        let convs = watched.convs();
         for (i, (weight, bias)) in self.idle.layers().enumerate() {
             let Some(means) = convs[i].input_means() else { continue };
             // What a ReLU lets through is what the next layer is given.
@@ -419,14 +355,14 @@ impl Trainer {
     }
 
     /// The model after a pass of what a lesson begins with, in which it noted the means.
-    fn watched(&self, lesson: &Lesson) -> Result<Model> {
-        let mut watched = self.model.clone();
-        watched.layers_mut().convs_mut().into_iter().for_each(Conv::watch);
+    fn watched(&self, lesson: &Lesson) -> Result<Box<dyn Network>> {
+        let mut watched = self.model.boxed();
+        watched.convs_mut().into_iter().for_each(Conv::watch);
         match lesson {
-            Lesson::Batch(Batch { seen, sigmas, .. }) => drop(watched.network()?.forward(seen, sigmas)?),
+            Lesson::Batch(Batch { seen, sigmas, .. }) => drop(watched.forward(seen, sigmas)?),
             Lesson::Unrolled { calls, .. } => {
                 let first = &calls[0];
-                drop(watched.network()?.forward(&tensor(first.input.clone())?, &[first.sigma])?);
+                drop(watched.forward(&tensor(first.input.clone())?, &[first.sigma])?);
             }
         }
         Ok(watched)
@@ -453,10 +389,10 @@ impl Trainer {
             Lesson::Unrolled { measurement, clean, calls } => {
                 let of_clean = |v: ArrayView4<'_, f32>| Ok(loss.with_slope(&v - &*clean));
                 let recipe = self.config.iterates.as_ref().expect("these lessons come of iterates").recipe();
-                recipe.gradient(measurement, calls, self.model.network()?, &self.vars, &of_clean)
+                recipe.gradient(measurement, calls, &*self.model, &self.vars, &of_clean)
             }
             Lesson::Batch(Batch { clean, seen, sigmas }) => {
-                let loss = loss.mean(&(self.model.network()?.forward(seen, sigmas)? - clean)?)?;
+                let loss = loss.mean(&(self.model.forward(seen, sigmas)? - clean)?)?;
                 let mut found = Gradients::zero(self.vars.len());
                 found.add_found(loss.to_scalar()?, &loss.backward()?, &self.vars)?;
                 Ok(found)
@@ -481,7 +417,7 @@ impl Trainer {
     /// # Errors
     /// When a tensor operation fails.
     pub fn weights(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut state = self.model.layers().state();
+        let mut state = self.model.state();
         for ((name, var), average) in self.vars.iter().zip(&self.average) {
             state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
         }
@@ -506,7 +442,7 @@ impl Trainer {
         if let Some(iterates) = &self.config.iterates {
             return NOISE_LEVELS
                 .into_iter()
-                .map(|sigma| self.score_reconstruction(&mut model, iterates, sigma))
+                .map(|sigma| self.score_reconstruction(&mut *model, iterates, sigma))
                 .collect();
         }
         let settings = &self.config.validation;
@@ -517,7 +453,10 @@ impl Trainer {
                 let clean = to_video(clip, settings.frames);
                 let mut noisy = clean.clone();
                 add_noise(&mut noisy, sigma / 255.0, &mut self.rng(VALIDATION_STREAM + i as u64));
-                let restored = model.restore(model.input(noisy).view(), sigma / 255.0)?;
+                let mut restored = Array4::zeros(clean.dim());
+                let call = Call::new(sigma / 255.0);
+                let inferred = model.infer(&call, self.seen(noisy).view(), restored.view_mut());
+                inferred.map_err(|e| Error::Data(e.to_string()))?;
                 for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                     sum += frame_psnr(clean, restored);
                     count += 1;
@@ -530,14 +469,19 @@ impl Trainer {
 
     /// PSNR of the middle of each held-out clip, its first frames measured through the same random masks every time, without noise or with that
     /// of a level in 0..255 units.
-    fn score_reconstruction(&self, model: &mut Model, settings: &IteratesConfig, sigma: Option<f32>) -> Result<Score> {
+    fn score_reconstruction(
+        &self,
+        model: &mut dyn Network,
+        settings: &IteratesConfig,
+        sigma: Option<f32>,
+    ) -> Result<Score> {
         let (mut sum, mut count) = (0.0, 0);
         for (i, clip) in self.data.validation.iter().enumerate() {
             let mut rng = self.rng(VALIDATION_STREAM + i as u64);
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
             let pattern = CfaPattern::ALL[i % 4];
             let measurement = camera::plain(clean.view(), pattern, sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
-            let restored = settings.recipe().solve(&measurement, model)?;
+            let restored = settings.recipe().solve(&measurement, &mut Solving(model))?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;
@@ -547,9 +491,9 @@ impl Trainer {
     }
 
     /// The model with these weights, for inference: constants are packed for the kernels once, not at each call.
-    fn frozen(&self, mut weights: BTreeMap<String, Tensor>) -> Model {
-        let mut model = self.model.clone();
-        for conv in model.layers_mut().convs_mut() {
+    fn frozen(&self, mut weights: BTreeMap<String, Tensor>) -> Box<dyn Network> {
+        let mut model = self.model.boxed();
+        for conv in model.convs_mut() {
             for (name, tensor, _) in conv.tensors_mut() {
                 if let Some(weight) = weights.remove(&name) {
                     *tensor = weight;

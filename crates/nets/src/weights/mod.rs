@@ -7,10 +7,7 @@ mod pickle;
 mod pth;
 mod stored;
 
-use crate::{
-    Ddnet, DdnetSpec, Ends, Error, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetSpec, Layers, Result, Shiftnet,
-    ShiftnetSpec,
-};
+use crate::{Architecture, Ends, Error, Result};
 use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,31 +15,6 @@ use std::path::{Path, PathBuf};
 pub use bundled::{bundled_for_iterates, bundled_names};
 use stored::Named;
 pub(crate) use stored::read_safetensors;
-
-/// The network that a set of tensors belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Architecture {
-    /// FFDNet, gray or color.
-    Ffdnet(FfdnetSpec),
-    /// FastDVDnet, gray or color.
-    Fastdvdnet(FastdvdnetSpec),
-    /// DDNet.
-    Ddnet(DdnetSpec),
-    /// ShiftNet, gray or color.
-    Shiftnet(ShiftnetSpec),
-}
-
-impl std::fmt::Display for Architecture {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Ffdnet(spec) => spec.fmt(f),
-            Self::Fastdvdnet(spec) => spec.fmt(f),
-            Self::Ddnet(spec) => spec.fmt(f),
-            Self::Shiftnet(spec) => spec.fmt(f),
-        }
-    }
-}
 
 /// One tensor of a weight file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -126,15 +98,10 @@ impl WeightFile {
     /// # Errors
     /// [`Error::UnknownArchitecture`].
     pub fn architecture(&self) -> Result<Architecture> {
-        ShiftnetSpec::recognise(self)
-            .map(Architecture::Shiftnet)
-            .or_else(|| FastdvdnetSpec::recognise(self).map(Architecture::Fastdvdnet))
-            .or_else(|| DdnetSpec::recognise(self).map(Architecture::Ddnet))
-            .or_else(|| FfdnetSpec::recognise(self).map(Architecture::Ffdnet))
-            .ok_or_else(|| Error::UnknownArchitecture {
-                path: self.path.clone(),
-                found: self.tensors.keys().cloned().collect(),
-            })
+        Architecture::recognise(self).ok_or_else(|| Error::UnknownArchitecture {
+            path: self.path.clone(),
+            found: self.tensors.keys().cloned().collect(),
+        })
     }
 
     /// Name, shape and stored type of every tensor.
@@ -166,19 +133,6 @@ impl WeightFile {
     }
 }
 
-/// The network of a weight file, whichever it is; video networks with circular ends.
-///
-/// # Errors
-/// When the file is of no known network, or its tensors do not fit together.
-pub fn network(file: WeightFile) -> Result<Box<dyn Layers>> {
-    Ok(match file.architecture()? {
-        Architecture::Ffdnet(_) => Box::new(Ffdnet::from_weights(file)?),
-        Architecture::Fastdvdnet(_) => Box::new(Fastdvdnet::from_weights(file, Ends::Circular)?),
-        Architecture::Ddnet(_) => Box::new(Ddnet::from_weights(file, Ends::Circular)?),
-        Architecture::Shiftnet(_) => Box::new(Shiftnet::from_weights(file)?),
-    })
-}
-
 /// Rewrites a `.pth` or `.safetensors` file as `.safetensors`, on request with batch norm folded into the convolutions.
 /// Writing `.pth` is not offered: it would take a pickle writer, and PyTorch reads `.safetensors`.
 ///
@@ -188,7 +142,7 @@ pub fn convert(input: &Path, output: &Path, fold_batch_norm: bool, storage: Stor
     if output.extension().is_none_or(|e| e != "safetensors") {
         return Err(Error::format(output, "weights are written as .safetensors only: give the file that extension"));
     }
-    let mut net = network(WeightFile::read(input)?)?;
+    let mut net = Architecture::load(WeightFile::read(input)?, Ends::Circular)?;
     if fold_batch_norm {
         net.fold_batch_norm()?;
     }

@@ -53,7 +53,7 @@ fn inspect(file: &Path) -> anyhow::Result<()> {
     }
     outln!("{} tensors, {} values", summary.len(), weights.value_count());
     // Building the network also checks that every tensor it needs is there.
-    let network = weights::network(weights)?;
+    let network = nets::Architecture::load(weights, nets::Ends::Circular)?;
     outln!("network: {}, {} parameters", network.describe(), network.parameter_count());
     Ok(())
 }

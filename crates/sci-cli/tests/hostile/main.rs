@@ -13,9 +13,8 @@ use std::path::Path;
 
 use ndarray::{Array3, Array4, ArrayViewD};
 use ndarray_npy::NpzWriter;
-use nets::Layers;
-use nets::WeightFile;
-use nets::weights::{Storage, network, write_safetensors};
+use nets::weights::{Storage, write_safetensors};
+use nets::{Architecture, Ends, Layers, WeightFile};
 use sci_cli::config;
 use sci_cli::io::mat::{self, Variable};
 use sci_cli::io::samples::Budget;
@@ -117,7 +116,8 @@ fn refused_within(budget: fn(usize) -> usize, name: &str, bytes: &[u8], read: im
 }
 
 fn is_network(bytes: &[u8]) -> bool {
-    WeightFile::parse("a.pth".as_ref(), bytes).and_then(network).is_ok()
+    let file = WeightFile::parse("a.pth".as_ref(), bytes);
+    file.is_ok_and(|file| Architecture::load(file, Ends::Circular).is_ok())
 }
 
 fn is_training(bytes: &[u8]) -> bool {
