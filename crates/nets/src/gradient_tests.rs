@@ -91,7 +91,7 @@ fn gradients_of_ddnet_are_slopes() {
 #[test]
 fn gradients_of_shiftnet_are_slopes() {
     for channels in [1, 3] {
-        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], depth: 1 };
+        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], blocks: [2, 1, 1] };
         check(Shiftnet::random(spec, 4).unwrap(), [3, channels, 8, 13]);
     }
 }

@@ -34,36 +34,48 @@ pub(crate) struct Body {
     pub(crate) ends: (usize, usize),
     /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
     pub(crate) widths: [usize; LEVELS],
-    /// Residual blocks at an eighth of the size; there are two at the other sizes. 1 to 16.
-    pub(crate) depth: usize,
+    /// Residual blocks at these sizes, at a half and a quarter as many on the way up again: 1 to 16 each.
+    pub(crate) blocks: [usize; LEVELS],
 }
 
 impl Body {
-    /// Channels found, widths and depth by the tensors of a file.
-    pub(crate) fn recognise(file: &WeightFile) -> Option<(usize, [usize; LEVELS], usize)> {
+    /// Channels found, widths and blocks by the tensors of a file.
+    pub(crate) fn recognise(file: &WeightFile) -> Option<(usize, [usize; LEVELS], [usize; LEVELS])> {
         let outputs = |name: &str| file.shape(&format!("{PREFIX}{name}.weight"))?.first().copied();
         let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
-        let blocks = (0..).take_while(|b| file.shape(&format!("{PREFIX}block{b}.0.weight")).is_some()).count();
-        Some((outputs("output")?, widths, blocks.checked_sub(2 * (LEVELS - 1))?))
+        let blocks = |place: &str| (0..).take_while(|k| outputs(&format!("{place}.{k}.0")).is_some()).count();
+        Some((outputs("output")?, widths, ["enter0", "enter1", "deepest"].map(blocks)))
     }
 
     pub(crate) fn validate(self) -> Result<()> {
         let bad =
             |key, value: usize, legal: &str| Err(Error::Setting { key, value: value.to_string(), legal: legal.into() });
         let width = |w: &usize| !(16..=512).contains(w) || !w.is_multiple_of(16);
-        match (self.depth, self.widths.into_iter().find(width)) {
-            (1..=16, None) => Ok(()),
-            (_, Some(wrong)) => bad("widths", wrong, "multiples of 16 from 16 to 512"),
-            (depth, _) => bad("depth", depth, "1 to 16"),
+        if let Some(wrong) = self.widths.into_iter().find(width) {
+            return bad("widths", wrong, "multiples of 16 from 16 to 512");
+        }
+        match self.blocks.into_iter().find(|n| !(1..=16).contains(n)) {
+            Some(wrong) => bad("blocks", wrong, "1 to 16 each"),
+            None => Ok(()),
         }
     }
 
-    /// What is done between the first and the last convolution.
-    fn steps(self) -> Vec<Step> {
-        let down = (0..LEVELS - 1).flat_map(|level| [Step::Block(level), Step::Down(level)]);
-        let deepest = std::iter::repeat_n(Step::Block(LEVELS - 1), self.depth);
-        let up = (0..LEVELS - 1).rev().flat_map(|level| [Step::Up(level), Step::Block(level)]);
-        down.chain(deepest).chain(up).collect()
+    /// What is done between the first and the last convolution, and the name of each.
+    fn steps(self) -> Vec<(String, Step)> {
+        let blocks = |place: String, level: usize| {
+            (0..self.blocks[level]).map(move |k| (format!("{place}.{k}"), Step::Block(level))).collect::<Vec<_>>()
+        };
+        let mut steps = Vec::new();
+        for level in 0..LEVELS - 1 {
+            steps.extend(blocks(format!("enter{level}"), level));
+            steps.push((format!("down{level}"), Step::Down(level)));
+        }
+        steps.extend(blocks("deepest".to_owned(), LEVELS - 1));
+        for level in (0..LEVELS - 1).rev() {
+            steps.push((format!("up{level}"), Step::Up(level)));
+            steps.extend(blocks(format!("leave{level}"), level));
+        }
+        steps
     }
 
     /// Name, channels, stride, ReLU, bias and silence of the layers, in the order in which they are done.
@@ -71,21 +83,18 @@ impl Body {
         let (w, (shown, found)) = (self.widths, self.ends);
         let plain = |name: &str, inputs, outputs| LayerSpec::new(name.to_owned(), inputs, outputs);
         let mut layers = vec![plain("input", shown, w[0])];
-        let mut blocks = 0;
-        for step in self.steps() {
+        for (name, step) in self.steps() {
             match step {
                 Step::Block(level) => {
-                    let name = |i: usize| format!("block{blocks}.{i}");
-                    layers.push(LayerSpec { relu: true, ..LayerSpec::new(name(0), w[level], w[level]) });
-                    layers.push(LayerSpec { silent: true, ..LayerSpec::new(name(1), w[level], w[level]) });
-                    blocks += 1;
+                    let half = |i: usize| plain(&format!("{name}.{i}"), w[level], w[level]);
+                    layers.push(LayerSpec { relu: true, ..half(0) });
+                    layers.push(LayerSpec { silent: true, ..half(1) });
                 }
                 Step::Down(level) => {
-                    let down = plain(&format!("down{level}"), w[level], w[level + 1]);
-                    layers.push(LayerSpec { stride: 2, relu: true, ..down });
+                    layers.push(LayerSpec { stride: 2, relu: true, ..plain(&name, w[level], w[level + 1]) });
                 }
                 Step::Up(level) => {
-                    let up = plain(&format!("up{level}"), w[level + 1], PHASES * w[level]);
+                    let up = plain(&name, w[level + 1], PHASES * w[level]);
                     layers.push(LayerSpec { silent: true, bias: false, ..up });
                 }
             }
@@ -144,7 +153,7 @@ impl Body {
         };
         let mut h = chain(layers(1), &[], shown)?;
         let mut above = Vec::new();
-        for step in self.steps() {
+        for (_, step) in self.steps() {
             h = match step {
                 Step::Block(_) => {
                     let shifted = h.apply_op1(TemporalShift::of(h.dim(1)?, frames))?;
@@ -171,7 +180,7 @@ impl Body {
     pub(crate) fn between(self, engine: &mut Engine, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
         let mut next = 1;
         let mut above: Vec<Vec<Blocked>> = Vec::new();
-        for step in self.steps() {
+        for (_, step) in self.steps() {
             match step {
                 Step::Block(_) => {
                     add_block(engine, next, &mut h)?;

@@ -37,14 +37,14 @@ pub struct ShiftnetSpec {
     pub channels: usize,
     /// Channels at a half, a quarter and an eighth of the size: multiples of 16 up to 512.
     pub widths: [usize; 3],
-    /// Residual blocks at an eighth of the size; there are two at the other sizes. 1 to 16.
-    pub depth: usize,
+    /// Residual blocks at these sizes, at a half and a quarter as many on the way up again: 1 to 16 each.
+    pub blocks: [usize; 3],
 }
 
 impl ShiftnetSpec {
     pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
-        let (outputs, widths, depth) = Body::recognise(file)?;
-        Some(Self { channels: outputs / PHASES, widths, depth })
+        let (outputs, widths, blocks) = Body::recognise(file)?;
+        Some(Self { channels: outputs / PHASES, widths, blocks })
     }
 
     pub(crate) fn validate(self) -> Result<Self> {
@@ -57,15 +57,15 @@ impl ShiftnetSpec {
 
     fn body(self) -> Body {
         let colors = PHASES * self.channels;
-        Body { ends: (colors + 1, colors), widths: self.widths, depth: self.depth }
+        Body { ends: (colors + 1, colors), widths: self.widths, blocks: self.blocks }
     }
 }
 
 impl std::fmt::Display for ShiftnetSpec {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let colors = if self.channels == 1 { "gray" } else { "color" };
-        let [a, b, c] = self.widths;
-        write!(f, "ShiftNet ({colors}, {a}/{b}/{c} channels, depth {})", self.depth)
+        let ([a, b, c], [k, l, m]) = (self.widths, self.blocks);
+        write!(f, "ShiftNet ({colors}, {a}/{b}/{c} channels, {k}/{l}/{m} blocks)")
     }
 }
 
@@ -252,7 +252,7 @@ mod tests {
 
     /// A network no layer of which is silent.
     fn loud(channels: usize) -> Shiftnet {
-        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], depth: 2 };
+        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], blocks: [1, 2, 2] };
         let mut net = Shiftnet::random(spec, 1).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         for (_, tensor, _) in net.convs.iter_mut().flat_map(Conv::tensors_mut) {
@@ -310,7 +310,7 @@ mod tests {
 
     #[test]
     fn an_untrained_network_gives_back_what_it_is_shown() {
-        let net = Shiftnet::random(ShiftnetSpec { channels: 1, widths: [16, 16, 16], depth: 1 }, 0).unwrap();
+        let net = Shiftnet::random(ShiftnetSpec { channels: 1, widths: [16; 3], blocks: [1; 3] }, 0).unwrap();
         let noisy = clip((2, 1, 8, 8), 7);
         assert!(difference(&forward(&net, noisy.view(), &[0.1]), &noisy) < 1e-6);
     }

@@ -84,8 +84,8 @@ pub enum NetworkConfig {
         channels: usize,
         /// Channels at a half, a quarter and an eighth of the size, multiples of 16 up to 512.
         widths: [usize; 3],
-        /// Residual blocks at an eighth of the size, 1 to 16.
-        depth: usize,
+        /// Residual blocks at these sizes, at a half and a quarter as many on the way up again: 1 to 16 each.
+        blocks: [usize; 3],
     },
 }
 
@@ -111,8 +111,8 @@ impl NetworkConfig {
                 (Architecture::Fastdvdnet(FastdvdnetSpec { channels, widths, batch_norm: false }), ends)
             }
             Self::Ddnet { widths, ends } => (Architecture::Ddnet(DdnetSpec { widths }), ends),
-            Self::Shiftnet { channels, widths, depth } => {
-                (Architecture::Shiftnet(ShiftnetSpec { channels, widths, depth }), Ends::default())
+            Self::Shiftnet { channels, widths, blocks } => {
+                (Architecture::Shiftnet(ShiftnetSpec { channels, widths, blocks }), Ends::default())
             }
         }
     }
@@ -120,7 +120,8 @@ impl NetworkConfig {
     /// Checks the network's size.
     fn validate(&self) -> Result<()> {
         // The network knows its keys, not the table that they are in.
-        const KEYS: [&str; 4] = ["network.channels", "network.width", "network.widths", "network.depth"];
+        const KEYS: [&str; 5] =
+            ["network.channels", "network.width", "network.widths", "network.depth", "network.blocks"];
         self.architecture().0.validate().map_err(|error| match error {
             Error::Setting { key, value, legal } => {
                 let key = KEYS.into_iter().find(|known| known.ends_with(&format!(".{key}"))).unwrap_or(key);

@@ -161,7 +161,7 @@ impl Trainer {
         Ok(Self { config, data, model, vars, adam, average, idle, random: true, rate: 1.0, step: 0 })
     }
 
-    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`].
+    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`], which the file may lack.
     ///
     /// # Errors
     /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
@@ -171,10 +171,8 @@ impl Trainer {
             let legal = "parts of the names of the network's layers".to_owned();
             return Err(Error::Setting { key: "renew", value: part.clone(), legal });
         }
-        self.model.set_state(weights)?;
         let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
-        let state = self.model.state().into_iter().chain(renewed).collect();
-        self.model.set_state(&state)?;
+        self.model.set_state(&weights.clone().into_iter().chain(renewed).collect())?;
         self.vars = self.model.make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
