@@ -58,6 +58,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
 const FFDNET: NetworkConfig = NetworkConfig::Ffdnet { channels: 1, width: 8, depth: 3 };
 const FASTDVDNET: NetworkConfig =
     NetworkConfig::Fastdvdnet { channels: 1, widths: [4, 4, 4], ends: nets::Ends::Circular };
+const SHIFTNET: NetworkConfig = NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks: [1, 1, 1] };
 const DDNET: NetworkConfig = NetworkConfig::Ddnet { widths: [4, 4, 4], ends: nets::Ends::Mirrored };
 
 fn trainer(config: &TrainConfig) -> Trainer {
@@ -80,7 +81,8 @@ fn resuming_is_the_straight_run_bit_for_bit() {
     // Wide enough for Muon's steps, and long enough to begin between two measurements of what the layers are given.
     let wide = NetworkConfig::Ffdnet { channels: 1, width: 16, depth: 4 };
     let wide_video = NetworkConfig::Fastdvdnet { channels: 1, widths: [4, 16, 16], ends: nets::Ends::Circular };
-    let networks = [(FFDNET, 1, 6), (FASTDVDNET, 3, 6), (DDNET, 3, 6), (wide, 1, 46), (wide_video, 3, 26)];
+    let networks =
+        [(FFDNET, 1, 6), (FASTDVDNET, 3, 6), (DDNET, 3, 6), (SHIFTNET, 3, 6), (wide, 1, 46), (wide_video, 3, 26)];
     for (network, frames, steps) in networks {
         let mut config = config(network, frames, steps);
         // Channels begin anew all the time.
@@ -137,6 +139,7 @@ fn training_on_iterates_learns_resumes_and_validates_by_reconstruction() {
         (color.clone(), false),
         (FFDNET, true),
         (FASTDVDNET, true),
+        (SHIFTNET, true),
         (color, true),
     ] {
         let mut config = on_iterates(config(network, 1, 24));
@@ -232,6 +235,30 @@ fn shut_layers_that_begin_anew_are_open_and_leave_the_network_what_it_was() {
         }
     }
     assert!(matches!(begin(&["upc3"]).1, Err(Error::Setting { key: "renew", .. })));
+}
+
+#[test]
+fn a_network_that_grows_is_at_first_what_it_was() {
+    let mut small = trainer(&config(SHIFTNET, 3, 8));
+    run(&mut small, 8);
+    let more = NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks: [2, 1, 3] };
+    let grown = |renew: &[&str]| {
+        let renew = renew.iter().map(|part| (*part).to_owned()).collect();
+        let mut trainer = trainer(&TrainConfig { weights: Some("small".into()), renew, ..config(more.clone(), 3, 8) });
+        let started = trainer.start_from(&small.weights().unwrap());
+        (trainer, started)
+    };
+    let (mut large, started) = grown(&["enter0.1", "leave0.1", "deepest.1", "deepest.2"]);
+    started.unwrap();
+    assert_eq!(large.validate().unwrap(), small.validate().unwrap());
+    let before = large.weights().unwrap();
+    run(&mut large, 8);
+    let moved = |name: &str| {
+        let (before, after) = (&before[name], &large.weights().unwrap()[name]);
+        (after - before).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap() > 0.0
+    };
+    assert!(moved("body.deepest.2.1.weight") && moved("body.enter0.0.0.weight"));
+    assert!(matches!(grown(&["enter0.1", "leave0.1"]).1, Err(Error::State { .. })));
 }
 
 #[test]
