@@ -1,6 +1,7 @@
 //! `sci calibrate`: how the masks of an experiment's scene really sit, from its measurements alone.
 
 use std::io::Write;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -12,6 +13,7 @@ use super::{Done, catch_interrupts, check_folder, interrupted};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
+use crate::progress::Progress;
 
 /// Arguments of `sci calibrate`.
 ///
@@ -49,7 +51,7 @@ impl Args {
         let (scene, chosen) = scene_and_choice(&experiment)?;
         let Self { reach, clock, .. } = self;
         let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };
-        let found = match calibration::find(&scene, &chosen, &settings, interrupted) {
+        let found = match shown_on_a_bar(|watch| calibration::find(&scene, &chosen, &settings, watch)) {
             Err(_) if interrupted() => return Ok(Done::Interrupted),
             found => found?,
         };
@@ -68,6 +70,24 @@ impl Args {
         outln!("wrote {0}; use it by --set data.calibration={0}/calibration.json", out.display());
         Ok(Done::Complete)
     }
+}
+
+/// Calibrates with a bar that shows how far it has come, until Ctrl-C.
+pub(super) fn shown_on_a_bar<T>(calibrate: impl FnOnce(calibration::Watch<'_>) -> T) -> T {
+    let mut shown: Option<Progress> = None;
+    let found = calibrate(&mut |done, expected| {
+        let bar = shown.get_or_insert_with(|| {
+            let mut bar = Progress::of("calibration", expected);
+            bar.start();
+            bar
+        });
+        bar.step(done, None);
+        if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    if let Some(bar) = shown {
+        bar.finish();
+    }
+    found
 }
 
 const COLUMNS: usize = 3;

@@ -22,7 +22,6 @@ mod train;
 mod weights;
 
 use std::path::Path;
-use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
@@ -89,15 +88,15 @@ pub enum Done {
 pub struct UsageError(pub String);
 
 impl Cli {
-    /// Runs the command and prints its error, if any.
-    pub fn execute(self) -> ExitCode {
+    /// Runs the command and prints its error, if any; the exit code.
+    pub fn execute(self) -> u8 {
         match self.dispatch() {
-            Ok(Done::Complete) => ExitCode::SUCCESS,
-            Ok(Done::Interrupted) => ExitCode::from(130),
+            Ok(Done::Complete) => 0,
+            Ok(Done::Interrupted) => 130,
             Err(error) => {
                 eprintln!("error: {}", chain(&error));
                 let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<Refusal>();
-                ExitCode::from(if usage { 2 } else { 1 })
+                if usage { 2 } else { 1 }
             }
         }
     }
@@ -132,7 +131,7 @@ impl Command {
 }
 
 /// The error and its causes on one line; a cause that the error before it already quotes is not repeated.
-fn chain(error: &anyhow::Error) -> String {
+pub fn chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let part = cause.to_string();
