@@ -13,8 +13,7 @@ use sci_cli::table::{Paths, Source, Table};
 use sci_forward::CfaPattern;
 
 use crate::arrays::{array, floats, out, row_major};
-use crate::failure::{Refused, raised, refused};
-use crate::pool;
+use crate::failure::{Refused, callers, raised, refused};
 use crate::settings;
 
 /// A denoiser of the program, for its solvers and for loops of your own: denoiser(noisy, sigma).
@@ -83,13 +82,13 @@ impl Denoiser {
         let x = x.into_dimensionality::<Ix4>().ok().filter(|x| x.len_of(Axis(1)) == channels && !x.is_empty());
         let x = x.filter(|_| !self.color || shape.len() == 4);
         let x = row_major(x.ok_or_else(|| refused(format!("`noisy` has shape {shape:?}, expected {axes}")))?);
-        let clean = pool::run(py, |_| {
+        let clean = py.detach(|| {
             let mut clean = Array4::zeros(x.dim());
             let call = Call { sigma, iteration, ..Call::default() };
             let (mut built, mut saving) = (self.lock(), Saving::default());
             on_frames(built.as_mut(), &mut saving)?.denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
             anyhow::Ok(clean)
-        })?;
+        });
         let clean = clean.map_err(raised)?.into_shape_with_order(IxDyn(&shape));
         Ok(out(py, clean.map_err(|e| refused(e.to_string()))?))
     }
@@ -112,7 +111,8 @@ impl Denoiser {
         let chosen = parts::read(table)?;
         let work = MultiplyAdds::default();
         let cfa = color.then(CfaPattern::default);
-        let mut built = chosen.part.build(&Site { cfa, adapt: Default::default(), work: &work })?;
+        let built = chosen.part.build(&Site { cfa, adapt: Default::default(), work: &work });
+        let mut built = built.map_err(callers)?;
         on_frames(built.as_mut(), &mut Saving::default())?;
         let has_sigma = chosen.part.instead_of_sigma().is_none();
         Ok(Self { kind: chosen.kind, color, has_sigma, built: Arc::new(Mutex::new(built)) })

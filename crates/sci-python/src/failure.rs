@@ -75,6 +75,11 @@ impl std::fmt::Display for Refused {
 
 impl Error for Refused {}
 
+/// An error of which only what the system says is not the caller's fault.
+pub(crate) fn callers(error: anyhow::Error) -> anyhow::Error {
+    if error.chain().any(|cause| cause.is::<std::io::Error>()) { error } else { Refused(chain(&error)).into() }
+}
+
 /// A `ValueError`.
 pub(crate) fn refused(message: impl Into<String>) -> PyErr {
     PyValueError::new_err(message.into())

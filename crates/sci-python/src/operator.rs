@@ -125,7 +125,7 @@ pub(crate) fn random_masks(
     masks(py, shape, |shape| MaskStack::random(shape, density, seed))
 }
 
-/// One random pattern that moves down by a pixel a frame, [T, H, W], 0 or 1. Parameters as for random_masks.
+/// One random pattern that moves to the left by a pixel a frame, [T, H, W], 0 or 1. Parameters as for random_masks.
 #[pyfunction]
 #[pyo3(signature = (shape, density=0.5, seed=0))]
 pub(crate) fn shifting_masks(

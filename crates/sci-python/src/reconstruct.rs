@@ -18,7 +18,7 @@ use sci_cli::record::{Record, Stop as Ended};
 use sci_cli::solve::{self, Show};
 
 use crate::arrays::{from_json, out, stored};
-use crate::failure::{Refused, raised};
+use crate::failure::{Refused, callers, raised};
 use crate::pool::{self, Stop};
 use crate::settings;
 
@@ -110,7 +110,7 @@ fn solve(
     let mut look =
         |_, _| if stop.is_set() { std::ops::ControlFlow::Break(()) } else { std::ops::ControlFlow::Continue(()) };
     let calibration: Option<Calibration> = solve::calibrate(experiment, &mut scene, &chosen, &mut look)?;
-    let mut factory = Factory::new(experiment, scene.cfa)?;
+    let mut factory = Factory::new(experiment, scene.cfa).map_err(callers)?;
     let (mut records, mut videos) = (Vec::new(), Vec::new());
     let mut previous = None;
     let iterations = factory.plan().iterations();

@@ -191,6 +191,9 @@ impl Solver {
         self.denoiser.check(stages.iter().map(|stage| stage.0), cfa.is_some())?;
         let mut plan =
             Plan::new(stages.iter().map(|&(sigma, iterations)| Stage { sigma, iterations }).collect::<Vec<_>>());
+        if !(0.0..=1.0).contains(&relative_change) {
+            return Err(refused(format!("relative_change = {relative_change} is not legal; legal: 0 to 1")));
+        }
         let time = seconds.map(Duration::try_from_secs_f64).transpose();
         plan.stop.time = time.map_err(|e| refused(format!("seconds: {e}")))?;
         plan.stop = StopRule { relative_change, ..plan.stop };

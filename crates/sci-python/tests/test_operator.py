@@ -48,7 +48,7 @@ def test_masks_are_made_from_a_seed():
     np.testing.assert_array_equal(a, b)
     assert (a != c).any() and set(np.unique(a)) == {0, 1} and abs(a.mean() - 0.25) < 0.05
     moving = sci.shifting_masks((4, 32, 32), 0.5, 3)
-    np.testing.assert_array_equal(moving[1, 1:], moving[0, :-1])
+    np.testing.assert_array_equal(moving[1, :, :-1], moving[0, :, 1:])
 
 
 def test_what_does_not_fit_is_a_value_error(masks):

@@ -40,7 +40,7 @@ def test_the_same_bits_as_the_command(two, tmp_path):
     np.savez(tmp_path / "scene.npz", mask=two.masks, meas=two.y, orig=two.truth)
     config = "gray/default"
     command = [sys.executable, "-m", "sci", "run", config, "--set", f"data.path={tmp_path / 'scene.npz'}", "--out", tmp_path / "run"]
-    subprocess.run([*command, "--set", "output=minimal", "--set", "stage.0.iterations=1"], check=True, cwd=tmp_path)
+    subprocess.run([*command, "--set", "output=minimal"], check=True, cwd=tmp_path)
     frames, record = sci.reconstruct(two.y, two.masks, config, two.truth, progress=False)
     np.testing.assert_array_equal(np.load(tmp_path / "run" / "recon.npy")[:, 0], frames)
     theirs = json.loads((tmp_path / "run" / "record.json").read_text())
@@ -116,9 +116,8 @@ def test_mistakes_are_value_errors_with_what_is_legal(scene):
         (lambda: sci.reconstruct(y.astype(complex), masks, **QUICK), "expected real numbers"),
         (lambda: sci.reconstruct(y, masks, "color/gap-tv"), "the scene is gray"),
     ]:
-        with pytest.raises((ValueError, RuntimeError, OSError), match=part) as raised:
+        with pytest.raises(ValueError, match=part):
             call()
-        assert "color" in part or "defualt" in part or raised.type is ValueError, raised
 
 
 def test_progress_is_told(scene, capsys):
@@ -185,11 +184,12 @@ def test_experiments_are_listed():
     assert {"gray/default", "color/default", "real/gray", "gray/gap-tv"} <= set(names)
 
 
-def test_a_divergence_is_a_warning(scene):
-    # Without its weights' σ a network far too strong is no divergence, but an unstable start is.
-    y = scene.y.copy()
+def test_a_divergence_is_a_warning(tmp_path):
+    path = tmp_path / "unstable.toml"
+    path.write_text('[solver]\nkind = "two-stage"\ntau = 1\n[denoiser]\nkind = "tv"\n[[stage]]\niterations = 300\n')
+    masks = sci.random_masks((4, 32, 32), seed=2)
+    video = np.zeros((4, 3, 32, 32), np.float32) + np.array([0.8, 0.4, 0.2], np.float32)[:, None, None]
+    y = sci.simulate(video, masks, cfa="rggb")
     with pytest.warns(RuntimeWarning, match="diverged in iteration"):
-        frames, record = sci.reconstruct(
-            y, scene.masks, "gray/gap-ffdnet", denoiser={"weights": "bundled:ffdnet_gray"}, progress=False
-        )
+        frames, record = sci.reconstruct(y, masks, path, progress=False, data={"cfa": "rggb"})
     assert np.isfinite(frames).all() and record["measurements"][0]["stop"] == "diverged"

@@ -67,7 +67,7 @@ def test_color_solvers():
     start, _ = sci.Gap(net).solve(y, masks, [], cfa="grbg")
     assert start.shape == (4, 3, 32, 32)
     with pytest.raises(ValueError, match="TwoStage is for color sensors"):
-        sci.TwoStage(net).solve(y, masks, [(0.1, 1)], cfa=None)
+        sci.TwoStage(sci.Denoiser("tv")).solve(y, masks, [(None, 1)])
 
 
 def test_what_the_denoiser_raises_is_raised(scene):
