@@ -1,7 +1,6 @@
 //! `sci calibrate`: how the masks of an experiment's scene really sit, from its measurements alone.
 
 use std::io::Write;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -9,11 +8,10 @@ use ndarray::Axis;
 use plotters::prelude::*;
 
 use super::run::scene_and_choice;
-use super::{Done, catch_interrupts, check_folder, interrupted};
+use super::{Done, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
-use crate::progress::Progress;
 
 /// Arguments of `sci calibrate`.
 ///
@@ -70,24 +68,6 @@ impl Args {
         outln!("wrote {0}; use it by --set data.calibration={0}/calibration.json", out.display());
         Ok(Done::Complete)
     }
-}
-
-/// Calibrates with a bar that shows how far it has come, until Ctrl-C.
-pub(super) fn shown_on_a_bar<T>(calibrate: impl FnOnce(calibration::Watch<'_>) -> T) -> T {
-    let mut shown: Option<Progress> = None;
-    let found = calibrate(&mut |done, expected| {
-        let bar = shown.get_or_insert_with(|| {
-            let mut bar = Progress::of("calibration", expected);
-            bar.start();
-            bar
-        });
-        bar.step(done, None);
-        if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    if let Some(bar) = shown {
-        bar.finish();
-    }
-    found
 }
 
 const COLUMNS: usize = 3;

@@ -21,12 +21,15 @@ mod simulate;
 mod train;
 mod weights;
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 
+use crate::calibration;
+use crate::progress::Progress;
 use crate::run_folder::Refusal;
 use crate::table::ConfigError;
 
@@ -161,6 +164,24 @@ fn catch_interrupts() -> anyhow::Result<()> {
         eprintln!("stopping after this iteration; what is finished will be written (Ctrl-C again to quit at once)");
     })
     .context("cannot handle Ctrl-C")
+}
+
+/// Calibrates with a bar that shows how far it has come, until Ctrl-C.
+fn shown_on_a_bar<T>(calibrate: impl FnOnce(calibration::Watch<'_>) -> T) -> T {
+    let mut shown: Option<Progress> = None;
+    let found = calibrate(&mut |done, expected| {
+        let bar = shown.get_or_insert_with(|| {
+            let mut bar = Progress::of("calibration", expected);
+            bar.start();
+            bar
+        });
+        bar.step(done, None);
+        if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    if let Some(bar) = shown {
+        bar.finish();
+    }
+    found
 }
 
 /// Refuses a file where results are to have a folder.

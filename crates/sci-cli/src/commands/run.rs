@@ -11,8 +11,7 @@ use ndarray::Axis;
 use sci_forward::VideoShape;
 use serde_json::json;
 
-use super::calibrate::shown_on_a_bar;
-use super::{Done, UsageError, catch_interrupts, check_folder, interrupted};
+use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::Calibration;
 use crate::config::{self, Experiment, MaskSource, Simulate};
 use crate::factory::Factory;
