@@ -20,6 +20,8 @@ use crate::failure::{Refused, raised, refused};
 use crate::operator::{operator, pattern};
 use crate::pool::{self, Stop};
 
+type MakeDemosaicer = fn() -> Box<dyn Demosaicer>;
+
 /// How a solver is made of what it plugs in.
 #[derive(Clone, Copy)]
 enum Method {
@@ -33,7 +35,7 @@ enum Method {
 pub(crate) struct Solver {
     method: Method,
     denoiser: Plugged,
-    demosaicer: fn() -> Box<dyn Demosaicer>,
+    demosaicer: MakeDemosaicer,
 }
 
 /// Generalised alternating projection: x ← v + Hᵀ (y − H v) / diag(H Hᵀ), v ← denoiser(x, sigma).
@@ -213,7 +215,7 @@ impl Solver {
 
 impl Solver {
     fn new(method: Method, denoiser: &Bound<'_, PyAny>, demosaicer: &str) -> PyResult<Self> {
-        let legal: [(&str, fn() -> Box<dyn Demosaicer>); 3] =
+        let legal: [(&str, MakeDemosaicer); 3] =
             [("malvar", || Box::new(Malvar)), ("menon", || Box::new(Menon)), ("bilinear", || Box::new(Bilinear))];
         let demosaicer = choice("demosaicer", demosaicer, &legal)?;
         Ok(Self { method, denoiser: Plugged::new(denoiser)?, demosaicer })

@@ -38,10 +38,11 @@ def test_several_measurements_are_one_video(two):
 
 def test_the_same_bits_as_the_command(two, tmp_path):
     np.savez(tmp_path / "scene.npz", mask=two.masks, meas=two.y, orig=two.truth)
-    config = "gray/default"
+    config, stage = "gray/default", [{"sigma": [20, 7], "iterations": 1}]
     command = [sys.executable, "-m", "sci", "run", config, "--set", f"data.path={tmp_path / 'scene.npz'}", "--out", tmp_path / "run"]
-    subprocess.run([*command, "--set", "output=minimal"], check=True, cwd=tmp_path)
-    frames, record = sci.reconstruct(two.y, two.masks, config, two.truth, progress=False)
+    sets = ["--set", "output=minimal", "--set", "stage=[{sigma=[20,7],iterations=1}]"]
+    subprocess.run([*command, *sets], check=True, cwd=tmp_path)
+    frames, record = sci.reconstruct(two.y, two.masks, config, two.truth, progress=False, stage=stage)
     np.testing.assert_array_equal(np.load(tmp_path / "run" / "recon.npy")[:, 0], frames)
     theirs = json.loads((tmp_path / "run" / "record.json").read_text())
     for ours, other in zip(record["measurements"], theirs["measurements"]):
