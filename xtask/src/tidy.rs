@@ -9,13 +9,16 @@ use anyhow::ensure;
 use crate::circles;
 use crate::workspace::{cargo, output, root};
 
-const CRATES: [&str; 5] = ["sci-forward", "admm", "nets", "online", "sci-cli"];
+const CRATES: [&str; 6] = ["sci-forward", "admm", "nets", "online", "sci-cli", "sci-python"];
+/// Crates with a program in `examples` that knows them only.
+const LIBRARIES: [&str; 4] = ["sci-forward", "admm", "nets", "online"];
 /// What a crate must not depend on, not even through others.
-const FORBIDDEN: [(&str, &[&str]); 5] = [
+const FORBIDDEN: [(&str, &[&str]); 6] = [
     ("sci-forward", &["image", "toml", "serde", "clap", "candle-core", "admm", "nets", "online", "sci-cli"]),
     ("admm", &["image", "toml", "clap", "candle-core", "nets", "online", "sci-cli"]),
     ("nets", &["image", "toml", "clap", "online", "sci-cli"]),
     ("online", &["image", "toml", "clap", "sci-cli"]),
+    ("sci-cli", &["pyo3", "sci-python"]),
     ("xtask", &["candle-core", "sci-forward", "admm", "nets", "online", "sci-cli"]),
 ];
 const MAX_LINES: usize = 800;
@@ -29,6 +32,7 @@ pub(crate) fn run() -> anyhow::Result<()> {
     broken.extend(CRATES.iter().flat_map(|name| circles(name)));
     broken.extend(architecture());
     broken.extend(documents());
+    broken.extend(LIBRARIES.iter().flat_map(|name| first_program(name)));
     broken.iter().for_each(|b| eprintln!("tidy: {b}"));
     ensure!(broken.is_empty(), "{} rules broken", broken.len());
     println!("tidy: {} files in order", files.len());
@@ -137,6 +141,23 @@ fn documents() -> Vec<String> {
             broken.push(format!("crates/{name}/src/lib.rs does not begin with what the crate owns (//!)"));
         }
     }
+    broken
+}
+
+/// The README of a library begins with its program in `examples`, which names no other crate of ours.
+fn first_program(name: &str) -> Vec<String> {
+    let read = |path: String| fs::read_to_string(root().join(path)).unwrap_or_default();
+    let readme = read(format!("crates/{name}/README.md"));
+    let program = read(format!("examples/{name}/src/main.rs"));
+    let first = readme.split_once("```rust\n").and_then(|(_, rest)| rest.split_once("```")).map(|(first, _)| first);
+    let mut broken = Vec::new();
+    if program.is_empty() || first != Some(program.as_str()) {
+        broken.push(format!("crates/{name}/README.md does not begin with examples/{name}/src/main.rs"));
+    }
+    let manifest = read(format!("examples/{name}/Cargo.toml"));
+    let named = |other: &&&str| manifest.lines().any(|line| line.starts_with(&format!("{other} =")));
+    let others = CRATES.iter().filter(|other| **other != name).filter(named);
+    broken.extend(others.map(|other| format!("examples/{name} names {other} too: it is to do with {name} alone")));
     broken
 }
 

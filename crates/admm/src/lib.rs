@@ -3,28 +3,7 @@
 //!
 //! A solver never sees ground truth, files, networks or the clock; observers and the stop rule do.
 //!
-//! ```
-//! use std::sync::Arc;
-//! use admm::sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
-//! use admm::{Gap, Plan, Stage, Start, Tv, run};
-//!
-//! // A bright square on a dark ground, one pixel further to the right in each frame.
-//! let shape = VideoShape { frames: 4, height: 32, width: 32 };
-//! let square = |(t, i, j)| if (8..20).contains(&i) && (8 + t..20 + t).contains(&j) { 0.9 } else { 0.1 };
-//! let truth = ndarray::Array3::from_shape_fn(shape.dim(), square);
-//! let h = MaskOperator::new(MaskStack::random(shape, 0.5, 0)?);
-//! let y = h.forward(truth.view());
-//!
-//! let measurement = Measurement::new(Arc::new(h), y)?;
-//! let mut solver = Gap::accelerated(Tv::new(0.1)); // TV has a weight of its own in the place of σ
-//! let plan = Plan::new([Stage { sigma: None, iterations: 60 }]);
-//! let outcome = run(&mut solver, &measurement, Start::Mean, &plan, &mut ())?;
-//! let still = run(&mut solver, &measurement, Start::Mean, &Plan::new([]), &mut ())?; // the start: every frame the same
-//! let rms = |x: ndarray::Array3<f32>| (x - &truth).mapv(|d| d * d).mean().unwrap().sqrt();
-//! let (solved, started) = (rms(outcome.estimate.sensor), rms(still.estimate.sensor));
-//! assert!(solved < 0.75 * started, "{solved} of {started}");
-//! # Ok::<(), Box<dyn std::error::Error>>(())
-//! ```
+#![doc = include_str!("../README.md")]
 
 mod adapters;
 mod calibrate;

@@ -1,18 +1,7 @@
 //! FFDNet, FastDVDnet and DDNet: the learned denoisers and demosaicer of plug-and-play reconstruction, on candle, with
 //! CPU convolution kernels of their own.
 //!
-//! ```
-//! use admm::{Call, Denoiser};
-//! use nets::{Ffdnet, FfdnetSpec, Layers};
-//! use ndarray::Array4;
-//!
-//! let mut net = Ffdnet::random(FfdnetSpec { width: 8, depth: 3, ..FfdnetSpec::GRAY }, 0)?;
-//! let noisy = Array4::from_elem((2, 1, 9, 7), 0.5);
-//! let mut clean = Array4::zeros(noisy.dim());
-//! net.denoise(&Call::new(25.0 / 255.0), noisy.view(), clean.view_mut())?;
-//! assert_eq!(net.describe(), "FFDNet (gray, 8 channels, 3 layers)");
-//! # Ok::<(), Box<dyn std::error::Error + Send + Sync>>(())
-//! ```
+#![doc = include_str!("../README.md")]
 
 mod architecture;
 mod ddnet;
@@ -32,6 +21,7 @@ pub mod unrolled;
 mod video;
 pub mod weights;
 
+pub use admm;
 pub use architecture::Architecture;
 pub use ddnet::{Ddnet, DdnetSpec};
 pub use error::{Error, KeyReport};

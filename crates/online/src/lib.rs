@@ -1,6 +1,8 @@
 //! Denoisers that adapt to the scene while they solve, by the measurement alone, and carry what they learned to the next
 //! measurement.
 //!
+#![doc = include_str!("../README.md")]
+//!
 //! [`AdaptiveDenoiser`] is a [`admm::Denoiser`] around a network: a solver does not know that it adapts. It learns from
 //! `ℓ = mean (H T v − y)²`, the error of its own output v at the sensor, when its [`UpdateSchedule`] says so; an update is
 //! undone when pixels of the measurement that it did not see disagree ([`RollBackRule`]). It sees what the solver was given
@@ -32,7 +34,7 @@ pub use adapt::AdaptiveDenoiser;
 pub use config::{AdaptConfig, AdaptLoss, RollBackRule};
 pub use error::Error;
 pub use loss::{PixelSplit, SplitLoss, accumulate_gradient};
-pub use nets::Parameters;
+pub use nets::{self, Parameters};
 pub use record::{RollBackReason, Update, UpdateCounts, UpdateOutcome};
 pub use reuse::{Relation, Reuse, Similarity, continuation};
 pub use schedule::UpdateSchedule;

@@ -12,7 +12,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::io::read_file;
 use crate::io::scene::Scene;
-use crate::progress::Progress;
 
 /// The version of the file.
 const SCHEMA: u32 = 1;
@@ -72,32 +71,23 @@ pub struct Parameter {
     pub curve: Vec<(f64, f64)>,
 }
 
+/// Is told after every solve how many are done and about how many there will be, and says whether to go on.
+pub type Watch<'w> = &'w mut dyn FnMut(usize, usize) -> ControlFlow<()>;
+
 /// Looks for the mismatch of a scene's masks, by the first few of these measurements.
 ///
 /// # Errors
-/// What [`admm::Calibration::find`] reports, also when `stopped` says so.
+/// What [`admm::Calibration::find`] reports, also when `watch` ends it.
 pub fn find(
     scene: &Scene,
     measurements: &[usize],
     settings: &admm::Calibration,
-    stopped: impl Fn() -> bool,
+    watch: Watch<'_>,
 ) -> anyhow::Result<Calibration> {
     let masks = masks_of(scene)?;
     let chosen: Vec<Array2<f32>> =
         measurements.iter().take(MOST_MEASUREMENTS).map(|&k| scene.y(k).to_owned()).collect();
-    let mut shown: Option<Progress> = None;
-    let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| {
-        let bar = shown.get_or_insert_with(|| {
-            let mut bar = Progress::of("calibration", progress.expected);
-            bar.start();
-            bar
-        });
-        bar.step(progress.solves, None);
-        if stopped() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    if let Some(bar) = shown {
-        bar.finish();
-    }
+    let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| watch(progress.solves, progress.expected));
     Ok(Calibration::of(found.context("calibration")?))
 }
 

@@ -6,7 +6,7 @@ use clap::Parser;
 
 fn main() -> ExitCode {
     keep_candle_to_one_thread();
-    sci_cli::commands::Cli::parse().execute()
+    ExitCode::from(sci_cli::commands::Cli::parse().execute())
 }
 
 /// Candle's own threads spin while they wait, beside rayon's that have the work: 7 % of a training step on two cores.

@@ -1,5 +1,7 @@
 //! The forward model of video snapshot compressive imaging, and nothing else: no solver, no file format, no network.
 //!
+#![doc = include_str!("../README.md")]
+//!
 //! A camera modulates `T` fast frames `x_t`, each by its own mask `C_t`, and sums them into one image:
 //!
 //! ```text

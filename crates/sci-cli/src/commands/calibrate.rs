@@ -8,7 +8,7 @@ use ndarray::Axis;
 use plotters::prelude::*;
 
 use super::run::scene_and_choice;
-use super::{Done, catch_interrupts, check_folder, interrupted};
+use super::{Done, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
@@ -49,7 +49,7 @@ impl Args {
         let (scene, chosen) = scene_and_choice(&experiment)?;
         let Self { reach, clock, .. } = self;
         let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };
-        let found = match calibration::find(&scene, &chosen, &settings, interrupted) {
+        let found = match shown_on_a_bar(|watch| calibration::find(&scene, &chosen, &settings, watch)) {
             Err(_) if interrupted() => return Ok(Done::Interrupted),
             found => found?,
         };

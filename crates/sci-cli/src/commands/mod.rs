@@ -21,13 +21,15 @@ mod simulate;
 mod train;
 mod weights;
 
+use std::ops::ControlFlow;
 use std::path::Path;
-use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 
+use crate::calibration;
+use crate::progress::Progress;
 use crate::run_folder::Refusal;
 use crate::table::ConfigError;
 
@@ -89,15 +91,15 @@ pub enum Done {
 pub struct UsageError(pub String);
 
 impl Cli {
-    /// Runs the command and prints its error, if any.
-    pub fn execute(self) -> ExitCode {
+    /// Runs the command and prints its error, if any; the exit code.
+    pub fn execute(self) -> u8 {
         match self.dispatch() {
-            Ok(Done::Complete) => ExitCode::SUCCESS,
-            Ok(Done::Interrupted) => ExitCode::from(130),
+            Ok(Done::Complete) => 0,
+            Ok(Done::Interrupted) => 130,
             Err(error) => {
                 eprintln!("error: {}", chain(&error));
                 let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<Refusal>();
-                ExitCode::from(if usage { 2 } else { 1 })
+                if usage { 2 } else { 1 }
             }
         }
     }
@@ -132,7 +134,7 @@ impl Command {
 }
 
 /// The error and its causes on one line; a cause that the error before it already quotes is not repeated.
-fn chain(error: &anyhow::Error) -> String {
+pub fn chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let part = cause.to_string();
@@ -162,6 +164,24 @@ fn catch_interrupts() -> anyhow::Result<()> {
         eprintln!("stopping after this iteration; what is finished will be written (Ctrl-C again to quit at once)");
     })
     .context("cannot handle Ctrl-C")
+}
+
+/// Calibrates with a bar that shows how far it has come, until Ctrl-C.
+fn shown_on_a_bar<T>(calibrate: impl FnOnce(calibration::Watch<'_>) -> T) -> T {
+    let mut shown: Option<Progress> = None;
+    let found = calibrate(&mut |done, expected| {
+        let bar = shown.get_or_insert_with(|| {
+            let mut bar = Progress::of("calibration", expected);
+            bar.start();
+            bar
+        });
+        bar.step(done, None);
+        if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    if let Some(bar) = shown {
+        bar.finish();
+    }
+    found
 }
 
 /// Refuses a file where results are to have a folder.

@@ -11,8 +11,8 @@ use ndarray::Axis;
 use sci_forward::VideoShape;
 use serde_json::json;
 
-use super::{Done, UsageError, catch_interrupts, check_folder, interrupted};
-use crate::calibration::{self, Calibration};
+use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
+use crate::calibration::Calibration;
 use crate::config::{self, Experiment, MaskSource, Simulate};
 use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
@@ -20,6 +20,7 @@ use crate::pictures::Studio;
 use crate::record::host;
 use crate::run_folder::{Finished, RunFolder, RunPlan, Wish, refuse_inputs};
 use crate::simulate::simulate;
+use crate::solve;
 
 /// Arguments of `sci run`.
 #[derive(Debug, clap::Args)]
@@ -51,10 +52,12 @@ impl Args {
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
         let (mut scene, chosen) = scene_and_choice(&experiment)?;
-        let calibration = match calibrate(&experiment, &mut scene, &chosen) {
+        let found = shown_on_a_bar(|watch| solve::calibrate(&experiment, &mut scene, &chosen, watch));
+        let calibration = match found {
             Err(_) if interrupted() => return Ok(Done::Interrupted),
             calibration => calibration?,
         };
+        calibration.iter().flat_map(Calibration::lines).for_each(|line| outln!("{line}"));
         let mut factory = Factory::new(&experiment, scene.cfa)?;
         let shape = result_shape(&scene);
         let all = [chosen.len() * shape[0], shape[1], shape[2], shape[3]];
@@ -117,18 +120,6 @@ impl Args {
     }
 }
 
-/// Moves the masks to where they really are, if that is asked for.
-fn calibrate(experiment: &Experiment, scene: &mut Scene, chosen: &[usize]) -> anyhow::Result<Option<Calibration>> {
-    let found = match &experiment.data.calibration {
-        config::Calibration::None => return Ok(None),
-        config::Calibration::File(path) => Calibration::read(path).context("data.calibration")?,
-        config::Calibration::Auto => calibration::find(scene, chosen, &admm::Calibration::default(), interrupted)?,
-    };
-    found.lines().iter().for_each(|line| outln!("{line}"));
-    found.apply(scene)?;
-    Ok(Some(found))
-}
-
 /// Solves what is left, with the pictures made meanwhile.
 fn solve(
     experiment: &Experiment,
@@ -171,7 +162,7 @@ fn result_shape(scene: &Scene) -> [usize; 4] {
 pub(super) fn scene_and_choice(experiment: &Experiment) -> anyhow::Result<(Scene, Vec<usize>)> {
     let scene = read_scene(experiment).context("data.path")?;
     scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
-    let chosen = choose(experiment, &scene)?;
+    let chosen = solve::choose(experiment, &scene).map_err(UsageError)?;
     Ok((scene, chosen))
 }
 
@@ -212,18 +203,4 @@ fn masks(
             masks
         }
     })
-}
-
-fn choose(experiment: &Experiment, scene: &Scene) -> anyhow::Result<Vec<usize>> {
-    let count = scene.len();
-    let chosen = experiment.data.measurements.clone().unwrap_or_else(|| (0..count).collect());
-    match chosen.iter().find(|&&k| k >= count) {
-        None => Ok(chosen),
-        Some(k) => Err(UsageError(format!(
-            "{}: `data.measurements` names {k}, but the scene has {count} (legal: 0 to {})",
-            experiment.data.path.display(),
-            count - 1
-        ))
-        .into()),
-    }
 }

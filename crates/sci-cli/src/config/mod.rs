@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::parts::{Chosen, Demosaicer, first_of_all};
+use crate::shipped;
 use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
 
@@ -84,12 +85,35 @@ pub struct WrittenFile {
     pub text: String,
 }
 
-/// Reads an experiment file with `--set` arguments applied.
+/// Reads an experiment file, or one that was [`shipped`] by its name, with `--set` arguments applied.
 ///
 /// # Errors
 /// [`ConfigError`] naming the place, the key, the value and what is legal.
 pub fn load(path: &Path, arguments: &[String]) -> Result<Experiment, ConfigError> {
-    from_source(&Source::read(path, "experiment", arguments)?, arguments)
+    from_source(&open(path, arguments)?, Paths::LookedUp, arguments)
+}
+
+/// The same for a scene that is in memory: what its `[data]` says of files need not be there, or be at all.
+///
+/// # Errors
+/// As [`load`], and if `[data]` asks for another scene than the one in memory.
+pub fn load_for_arrays(path: &Path, arguments: &[String]) -> Result<Experiment, ConfigError> {
+    let source = open(path, arguments)?;
+    let experiment = from_source(&source, Paths::AllButScene, arguments)?;
+    let data = &experiment.data;
+    let other = [
+        ("data.kind", data.simulate.is_some()),
+        ("data.mask", data.reading.mask.is_some()),
+        ("data.raw", data.reading.raw.is_some()),
+    ];
+    match other.into_iter().find(|(_, given)| *given) {
+        Some((key, _)) => Err(source.error_at(key, format!("`{key}` has no effect on arrays: they are the scene"))),
+        None => Ok(experiment),
+    }
+}
+
+fn open(path: &Path, arguments: &[String]) -> Result<Source, ConfigError> {
+    Source::read(&shipped::located(path), "experiment", arguments)
 }
 
 /// Reads an experiment from a record; its files need not be there any more.
@@ -100,7 +124,7 @@ pub fn load_written(written: &Written) -> Result<Experiment, ConfigError> {
     let held = |path: &Path| written.extends.iter().find(|base| Path::new(&base.file) == path);
     let read = |path: &Path| held(path).map(|base| base.text.clone()).ok_or("the record does not hold it".to_owned());
     let source = Source::new(written.file.file.as_ref(), &written.file.text, &written.set, &read)?;
-    from_source(&source, &written.set)
+    from_source(&source, Paths::LookedUp, &written.set)
 }
 
 /// Checks everything but whether files are where they are said to be.
@@ -112,9 +136,9 @@ pub fn check(source: &Source) -> Result<Experiment, ConfigError> {
 }
 
 /// A file that is missing is told only of an experiment that is right otherwise.
-fn from_source(source: &Source, arguments: &[String]) -> Result<Experiment, ConfigError> {
+fn from_source(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experiment, ConfigError> {
     check(source)?;
-    read(source, Paths::LookedUp, arguments)
+    read(source, paths, arguments)
 }
 
 /// The tables of an experiment before they are read.
@@ -210,7 +234,9 @@ fn unless_off<T>(
 impl Written {
     fn of(source: &Source, arguments: &[String]) -> Self {
         let file = |(path, text): (&Path, &str)| {
-            let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+            let absolute =
+                Some(path).filter(|path| !shipped::is_shipped(path)).and_then(|p| std::path::absolute(p).ok());
+            let absolute = absolute.unwrap_or_else(|| path.to_owned());
             WrittenFile { file: absolute.to_string_lossy().into_owned(), text: text.to_owned() }
         };
         let mut files = source.files().map(file);

@@ -38,6 +38,19 @@ pub enum Paths {
     AsWritten,
     /// Find them.
     LookedUp,
+    /// Find all but the files of the scene, which is in memory.
+    AllButScene,
+}
+
+impl Paths {
+    /// Whether what is named under a dotted key must be there.
+    fn looks_up(self, key: &str) -> bool {
+        match self {
+            Self::AsWritten => false,
+            Self::LookedUp => true,
+            Self::AllButScene => !["data.path", "data.mask"].contains(&key),
+        }
+    }
 }
 
 /// A table while it is read.
@@ -243,7 +256,7 @@ impl<'s> Table<'s> {
         let text = self.text(key, legal, |p| !p.is_empty());
         let found = match (self.place_of(key), text) {
             (None, _) => Err(self.error(format!("`{}` is missing; legal: {legal}", self.key_of(key)))),
-            (Some(span), Some(text)) if self.paths == Paths::LookedUp => {
+            (Some(span), Some(text)) if self.paths.looks_up(&self.key_of(key)) => {
                 locate(&paths::Written { key: self.key_of(key), text: &text, span }, self.source)
             }
             (Some(_), text) => Ok(PathBuf::from(text.unwrap_or_default())),

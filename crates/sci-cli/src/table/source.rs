@@ -13,6 +13,8 @@ use std::path::{Path, PathBuf};
 use toml::Spanned;
 use toml::de::{DeArray, DeString, DeTable, DeValue};
 
+use crate::shipped;
+
 /// Where a value was given.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
@@ -58,11 +60,15 @@ pub struct Source {
 /// The most that a file may hold.
 const MOST_BYTES: u64 = 1 << 20;
 
-/// The text of a file of experiments; `what` it is, for the message.
+/// The text of a file of experiments, or of one that was [`shipped`]; `what` it is, for the message.
 ///
 /// # Errors
 /// A file that cannot be read, is no text, or is longer than any such file.
 pub fn read_text(path: &Path, what: &str) -> Result<String, String> {
+    if shipped::is_shipped(path) {
+        let missing = || format!("there is no such {what}: {}", shipped::names().collect::<Vec<_>>().join(", "));
+        return shipped::text(path).map(str::to_owned).ok_or_else(missing);
+    }
     let read = || {
         let mut bytes = Vec::new();
         File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
@@ -126,7 +132,8 @@ impl Source {
             return Err(self.not_legal(&span, EXTENDS, legal));
         };
         let refuse = |problem: String| Err(self.error(&span, format!("`{EXTENDS}` = {name:?}: {problem}")));
-        let path = folder_of(file).join(name);
+        let named = Path::new(name);
+        let path = if shipped::is_shipped(named) { named.to_owned() } else { folder_of(file).join(name) };
         if self.files.iter().any(|(known, _)| identity(known) == identity(&path)) {
             let names = self.files.iter().map(|(path, _)| path).chain([&path]);
             let chain: Vec<String> = names.map(|path| path.display().to_string()).collect();

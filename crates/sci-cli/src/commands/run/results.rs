@@ -14,9 +14,10 @@ use crate::io::recon::{Parts, VideoFormat, join, link_or_copy};
 use crate::io::scene::Scene;
 use crate::io::video::join_gifs;
 use crate::pictures::{PIECE, PREVIEW, frame_name};
-use crate::record::{MeanRecord, MeasurementRecord, Record, SCHEMA, Stop, host};
+use crate::record::{Record, Stop};
 use crate::report;
 use crate::run_folder::{Finished, RECORD, RunFolder};
+use crate::solve;
 
 /// The file of the page.
 const REPORT: &str = "report.html";
@@ -107,7 +108,9 @@ impl Results<'_> {
                 link_or_copy(&from, &folder.out(name)?)?;
             }
         }
-        let record = self.record(solved, files)?;
+        let measurements = solved.iter().map(|f| f.record.clone()).collect();
+        let record =
+            solve::record(self.experiment, self.factory, measurements, files, self.calibration.clone(), self.begin)?;
         if self.experiment.output.report {
             let pieces: Vec<PathBuf> = solved.iter().map(|f| f.pictures().join(PIECE)).collect();
             report::write(&folder.out(REPORT)?, &record, &pieces)?;
@@ -132,32 +135,6 @@ impl Results<'_> {
             write_atomically(&folder.out(PREVIEW)?, |w| join_gifs(w, &parts))?;
         }
         Ok(())
-    }
-
-    fn record(&self, solved: &[Finished], files: Vec<String>) -> anyhow::Result<Record> {
-        let measurements: Vec<MeasurementRecord> = solved.iter().map(|f| f.record.clone()).collect();
-        let halved = measurements.iter().fold(0.0, |most, m| m.skipped.precision.max(most));
-        Ok(Record {
-            schema: SCHEMA,
-            experiment: self.experiment.name.clone(),
-            scene: self.experiment.scene_name(),
-            solver: self.experiment.solver.kind.to_owned(),
-            denoiser: self.experiment.denoiser_kinds(),
-            mean: MeanRecord::of(&measurements),
-            measurements,
-            peak_rss_bytes: host::peak_rss_bytes(),
-            threads: rayon::current_num_threads(),
-            seed: self.experiment.seed,
-            version: host::VERSION.to_owned(),
-            revision: host::REVISION.to_owned(),
-            cpu: host::cpu(),
-            kernel: self.factory.kernel()?.to_owned(),
-            precision_used: self.factory.precision_used(halved)?.to_owned(),
-            wall_seconds: self.begin.elapsed().as_secs_f64(),
-            files,
-            calibration: self.calibration.clone(),
-            config: self.experiment.record_json(),
-        })
     }
 }
 

@@ -1,20 +1,17 @@
 //! Solves the measurements of a run one by one, and puts each on disk as soon as it is solved.
 
-use std::ops::ControlFlow;
-
-use admm::{BoxError, IterInfo, Observer, Plan, StopReason};
 use anyhow::Context;
-use ndarray::{Array3, ArrayView3, ArrayView4};
-use sci_forward::metrics::{mean_over_frames, psnr, ssim, ssim_gaussian};
+use ndarray::Array3;
 
 use super::super::interrupted;
 use crate::config::Experiment;
-use crate::factory::{Factory, Follow, Solved};
+use crate::factory::Factory;
 use crate::io::scene::Scene;
 use crate::pictures::Job;
 use crate::progress::Progress;
-use crate::record::{MeasurementRecord, Skipped, Stop, Trace};
+use crate::record::{MeasurementRecord, Stop};
 use crate::run_folder::RunFolder;
+use crate::solve::{self, Show};
 
 /// Solves what is left of `chosen`, until Ctrl-C. Every solved measurement is in the folder before it is handed to `show`, which
 /// says whether to go on.
@@ -32,17 +29,13 @@ pub(super) fn solve_all(
         if interrupted() {
             break;
         }
-        let truth = scene.truth_of(k);
-        let mut watch = Watch::new(truth, Progress::new(k, planned));
+        let mut bar = Bar(Progress::new(k, planned));
         let start = previous.as_ref().map(|sensor| sensor.view());
-        let solved =
-            factory.solve(scene, &chosen[i..], start, &mut watch).with_context(|| format!("measurement {k}"))?;
-        let mut record = measurement_record(k, &solved, truth, watch.finish(), planned);
-        let estimate = solved.outcome.estimate;
-        record.psnr_rgb_db = estimate.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
+        let (record, estimate) = solve::measurement(factory, scene, &chosen[i..], start, &mut bar)?;
+        bar.0.finish();
         outln!("{}", line(&record));
         if record.stop == Stop::Diverged {
-            eprintln!("{}", advice(&record, experiment));
+            eprintln!("{}", solve::advice(&record, experiment));
         }
         let (whole, saves) = (record.stop != Stop::Observer, factory.needs_weights());
         folder.store(record, &estimate, factory.needs_previous(), whole, |dir| {
@@ -69,58 +62,6 @@ fn pass_solved(scene: &Scene, factory: &mut Factory<'_>, folder: &RunFolder) -> 
         factory.load_weights(&last.weights())?;
     }
     Ok(sensor)
-}
-
-/// How measurement `index` went; `whole` are the iterations of the schedule.
-fn measurement_record(
-    index: usize,
-    solved: &Solved,
-    truth: Option<ArrayView3<'_, f32>>,
-    trace: Trace,
-    whole: usize,
-) -> MeasurementRecord {
-    let Solved { outcome, planned, work, adaptation } = solved;
-    let x = outcome.estimate.sensor.view();
-    // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
-    // does not.
-    let left = match outcome.stop {
-        StopReason::ScheduleDone | StopReason::Converged | StopReason::Stalled => planned - outcome.iterations,
-        StopReason::Diverged | StopReason::TimeUp | StopReason::Observer => 0,
-    };
-    let counts = adaptation.as_ref().map(|a| a.counts).unwrap_or_default();
-    MeasurementRecord {
-        index,
-        psnr_db: truth.map(|t| mean_over_frames(t, x, psnr)),
-        ssim: truth.map(|t| mean_over_frames(t, x, ssim)),
-        ssim_gaussian: truth.map(|t| mean_over_frames(t, x, ssim_gaussian)),
-        psnr_rgb_db: None,
-        seconds: outcome.seconds,
-        iterations: outcome.iterations,
-        stop: outcome.stop.into(),
-        backed_off: outcome.backed_off.map(Into::into),
-        relative_residual: Some(outcome.relative_residual),
-        updates: counts.kept,
-        denoiser_calls: outcome.iterations,
-        gmac: work.gmac,
-        skipped: Skipped {
-            iterations: whole - planned + left,
-            tiles: work.skipped_tiles,
-            precision: work.halved,
-            updates: counts.skipped,
-        },
-        online: adaptation.clone(),
-        trace,
-    }
-}
-
-/// Mean over the frames of the PSNR over all three colors, `[T, 3, H, W]`.
-fn psnr_rgb(truth: ArrayView4<'_, f32>, video: ArrayView4<'_, f32>) -> f64 {
-    let (t, c, h, w) = truth.dim();
-    // The colors of a frame one below the other are one image of three times the height.
-    let stacked = (t, c * h, w);
-    let (truth, video) = (truth.to_shape(stacked), video.to_shape(stacked));
-    let same = "the same number of pixels";
-    mean_over_frames(truth.expect(same).view(), video.expect(same).view(), psnr)
 }
 
 fn line(m: &MeasurementRecord) -> String {
@@ -153,64 +94,23 @@ fn line(m: &MeasurementRecord) -> String {
     format!("measurement {k:>2}   {quality}   {iterations} iterations   {seconds:.2} s{updates}{backed_off}{note}")
 }
 
-fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
-    let suggestion = experiment.solver.advice(m.backed_off.is_some());
-    format!("measurement {} diverged in iteration {}: {suggestion}", m.index, m.iterations.saturating_sub(1))
-}
+/// Shows a solve on the terminal, until Ctrl-C.
+struct Bar(Progress);
 
-/// Follows one solve: convergence curve, progress, Ctrl-C.
-struct Watch<'t> {
-    truth: Option<ArrayView3<'t, f32>>,
-    trace: Trace,
-    progress: Progress,
-}
-
-impl<'t> Watch<'t> {
-    fn new(truth: Option<ArrayView3<'t, f32>>, progress: Progress) -> Self {
-        Self { truth, trace: Trace::default(), progress }
+impl Show for Bar {
+    fn begin(&mut self) {
+        self.0.start();
     }
 
-    fn finish(self) -> Trace {
-        self.progress.finish();
-        self.trace
-    }
-}
-
-impl Observer for Watch<'_> {
-    fn begin(&mut self, _: &Plan) -> Result<(), BoxError> {
-        self.progress.start();
-        Ok(())
+    fn update(&mut self, done: usize) {
+        self.0.update(done);
     }
 
-    fn warm_start(&mut self, _: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
-        Ok(go_on())
+    fn step(&mut self, done: usize, psnr_db: Option<f64>) {
+        self.0.step(done, psnr_db);
     }
 
-    fn iteration(&mut self, it: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
-        let psnr_db = self.truth.map(|truth| mean_over_frames(truth, it.estimate.sensor.view(), psnr));
-        if psnr_db.is_some() {
-            self.trace.psnr_db.push(psnr_db);
-        }
-        self.trace.relative_residual.push(Some(it.relative_residual));
-        self.trace.relative_change.push(Some(it.relative_change));
-        self.trace.seconds.push(it.seconds);
-        self.trace.sigma.push(it.sigma.unwrap_or(0.0));
-        if it.predicted_error.is_some() {
-            self.trace.predicted_error.push(it.predicted_error);
-        }
-        self.progress.step(it.iteration + 1, psnr_db);
-        Ok(go_on())
+    fn stopped(&self) -> bool {
+        interrupted()
     }
-}
-
-impl Follow for Watch<'_> {
-    fn adaptation(&mut self, updates: usize) -> ControlFlow<()> {
-        self.progress.update(updates);
-        go_on()
-    }
-}
-
-/// Until Ctrl-C.
-fn go_on() -> ControlFlow<()> {
-    if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
 }

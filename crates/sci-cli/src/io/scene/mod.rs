@@ -25,7 +25,7 @@ mod shift;
 mod source;
 
 pub use error::SceneError;
-pub use read::{Video, as_read, read, read_gray_video, read_mask, read_video};
+pub use read::{Arrays, Video, as_read, of_arrays, read, read_gray_video, read_mask, read_video};
 pub use sensor::{Clip, Sensor};
 pub use shift::MaskShift;
 

@@ -63,10 +63,38 @@ impl Parts {
 /// [`SceneError`] naming the file and the variable at fault.
 pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     let source = Source::open(path, reading.raw)?;
-    let mut parts = Parts::of(&source, reading)?;
+    let parts = Parts::of(&source, reading)?;
+    assembled(&source, parts, reading)
+}
+
+/// Arrays of any number type, in the layout that NumPy's users have: masks `[B, H, W]`, measurements `[N, H, W]` or `[H, W]`, truth
+/// `[T, H, W]`, `[T, 3, H, W]` or `[T, H, W, 3]`.
+#[derive(Clone, Debug)]
+pub struct Arrays {
+    /// Masks.
+    pub mask: Array,
+    /// Measurements; simulated from the truth if there are none.
+    pub meas: Option<Array>,
+    /// What was in front of the camera.
+    pub truth: Option<Array>,
+}
+
+/// A scene of arrays in memory, taken as a `.npz` file of them would be.
+///
+/// # Errors
+/// [`SceneError`] naming the array at fault.
+pub fn of_arrays(arrays: Arrays, reading: &Reading) -> Result<Scene, SceneError> {
+    let Arrays { mask, meas, truth } = arrays;
+    let is_rgb = truth.as_ref().is_some_and(|x| matches!(x.shape(), [_, 3, _, _] | [_, _, _, 3]));
+    let (orig, rgb) = if is_rgb { (None, truth) } else { (truth, None) };
+    let (keys, names, notes) = (reading.keys.clone(), Vec::new(), Vec::new());
+    assembled(&Source::memory(), Parts { keys, names, mask: Some(mask), meas, orig, rgb, notes }, reading)
+}
+
+fn assembled(source: &Source, mut parts: Parts, reading: &Reading) -> Result<Scene, SceneError> {
     let mut notes = std::mem::take(&mut parts.notes);
-    let (mut mask, in_own_unit) = scene_masks(&source, &mut parts, reading, &mut notes)?;
-    let mut truth = truth(&source, &parts, reading, &mut notes)?;
+    let (mut mask, in_own_unit) = scene_masks(source, &mut parts, reading, &mut notes)?;
+    let mut truth = truth(source, &parts, reading, &mut notes)?;
     if parts.meas.is_none() && truth.is_none() {
         return Err(source.missing(
             &parts.keys.meas,
@@ -80,7 +108,7 @@ pub fn read(path: &Path, reading: &Reading) -> Result<Scene, SceneError> {
     let mut meas = stored.as_ref().map(|array| place.frames(array, 1.0)).transpose()?;
     let is_color = reading.cfa.is_some() || matches!(truth, Some(Truth::Rgb(_)));
     if let Some(shift) = reading.shift {
-        mask = moved_masks(&source, mask, (shift, is_color), meas.as_mut(), truth.as_mut(), &mut notes)?;
+        mask = moved_masks(source, mask, (shift, is_color), meas.as_mut(), truth.as_mut(), &mut notes)?;
     } else if mask.len_of(Axis(0)) == 1 {
         notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
     }

@@ -25,6 +25,8 @@ enum Content {
     File(Vec<u8>, Format),
     /// A file of which is said what it holds.
     Raw(Vec<u8>, Raw),
+    /// Arrays in memory, which are handed on beside it.
+    Memory,
 }
 
 impl Source {
@@ -44,10 +46,16 @@ impl Source {
         Ok(Self { path: path.to_owned(), file: path.display().to_string(), content })
     }
 
+    /// Of a scene in memory.
+    pub(super) fn memory() -> Self {
+        let file = "arrays".to_owned();
+        Self { path: PathBuf::from(&file), file, content: Content::Memory }
+    }
+
     /// The format, of the arrays in a folder that of each.
     pub(super) fn format(&self) -> Format {
         match &self.content {
-            Content::Arrays(_) => Format::Npy,
+            Content::Arrays(_) | Content::Memory => Format::Npy,
             Content::Pictures => Format::Png,
             Content::File(_, format) => *format,
             Content::Raw(..) => Format::Raw,
@@ -56,7 +64,10 @@ impl Source {
 
     /// Whether its arrays have names.
     pub(super) fn is_named(&self) -> bool {
-        matches!(self.content, Content::Arrays(_) | Content::File(_, Format::Mat | Format::Hdf5 | Format::Npz))
+        matches!(
+            self.content,
+            Content::Arrays(_) | Content::Memory | Content::File(_, Format::Mat | Format::Hdf5 | Format::Npz)
+        )
     }
 
     /// What it is, for a message.
@@ -72,6 +83,7 @@ impl Source {
     pub(super) fn names(&self) -> Result<Vec<String>, SceneError> {
         match &self.content {
             Content::Arrays(names) => Ok(names.clone()),
+            Content::Memory => Ok(Vec::new()),
             _ if self.is_named() => Ok(self.arrays(&[])?.names),
             _ => Ok(Vec::new()),
         }
@@ -102,7 +114,7 @@ impl Source {
             Content::Pictures => Ok(frames::read(&self.path)?),
             Content::File(bytes, _) => Ok(read_single(bytes).map_err(|e| FileError::new(&self.path, e))?),
             Content::Raw(bytes, raw) => Ok(raw::read(bytes, *raw).map_err(|e| FileError::new(&self.path, e))?),
-            Content::Arrays(_) => Err(FileError::new(&self.path, ReadError::NoFrames).into()),
+            Content::Arrays(_) | Content::Memory => Err(FileError::new(&self.path, ReadError::NoFrames).into()),
         }
     }
 
