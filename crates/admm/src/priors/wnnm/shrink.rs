@@ -118,7 +118,7 @@ impl<'a> Shrinker<'a> {
         // Those that are alike are worked on together, and those of which nothing but the mean is kept not at all.
         let mut order: Vec<usize> = (0..members.len()).collect();
         let share = |&index: &usize| self.groups[index].energy / self.groups[index].least;
-        order.retain(|index| !(share(index) <= 1.0));
+        order.retain(|index| share(index) > 1.0 || share(index).is_nan());
         order.sort_by(|a, b| share(a).total_cmp(&share(b)));
         let mut dimensions = STEP;
         for some in order.chunks(GROUPS) {
