@@ -151,23 +151,20 @@ fn not_toml() {
 }
 
 #[test]
-fn what_is_not_there_yet_is_refused() {
-    fails(
-        &bench(),
-        &["--set", "denoiser.kind=wavelet"],
-        2,
-        &["--set denoiser.kind=wavelet", "`denoiser.kind` = wavelet", "not available yet"],
-    );
-}
-
-#[test]
-fn settings_of_wnnm_are_checked() {
+fn settings_of_wnnm_and_wavelets_are_checked() {
     for (denoiser, needles) in [
         ("denoiser={kind=\"wnnm\",patch=1}", ["`denoiser.patch` = 1", "2 to 16"]),
-        ("denoiser={kind=\"wnnm\",weight=0.1}", ["weight", "window"]),
+        ("denoiser={kind=\"wnnm\",lambda=0.1}", ["lambda", "window"]),
+        ("denoiser={kind=\"wnnm\",match_every=0}", ["`denoiser.match_every` = 0", "1 to 1000"]),
+        ("denoiser={kind=\"wavelet\",levels=9}", ["`denoiser.levels` = 9", "1 to 8"]),
+        ("denoiser={kind=\"wavelet\",threshold=-1}", ["`denoiser.threshold` = -1", "0 to 100"]),
     ] {
         fails(&bench(), &["--set", denoiser], 2, &needles);
     }
+    // A tile is another video than the one before it.
+    let kept = ["denoiser={kind=\"wnnm\",match_every=2}", "stage.0.sigma=20", "skip.enabled=true"];
+    let kept = kept.map(|set| ["--set", set]).concat();
+    fails(&bench(), &kept, 2, &["`skip.tiles` is true", "denoiser.match_every", "legal: false"]);
 }
 
 #[test]

@@ -71,8 +71,17 @@ pub(crate) struct Sci {
 impl Sci {
     /// Builds it in release mode. `data` as for [`shared`], but it need not be there.
     pub(crate) fn build(data: Option<&Path>) -> anyhow::Result<Self> {
-        let messages =
-            output(cargo().args(["build", "--release", "-p", "sci-cli", "--bin", "sci", "--message-format=json"]))?;
+        Self::build_with(&["--release"], data)
+    }
+
+    /// Builds it in the profile of the tests, which is optimised too, and there after them.
+    pub(crate) fn build_as_tests_do() -> anyhow::Result<Self> {
+        Self::build_with(&[], None)
+    }
+
+    fn build_with(profile: &[&str], data: Option<&Path>) -> anyhow::Result<Self> {
+        let usual = ["build", "-p", "sci-cli", "--bin", "sci", "--message-format=json"];
+        let messages = output(cargo().args(usual).args(profile))?;
         let program = json_lines(&messages)
             .find_map(|message| message["executable"].as_str().map(PathBuf::from))
             .context("cargo did not name the binary it built")?;

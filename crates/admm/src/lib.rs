@@ -1,5 +1,5 @@
 //! Plug-and-play solvers for snapshot compressive imaging: one loop ([`run`]), solvers that take any [`Prior`]
-//! ([`Gap`], [`Admm`], [`TwoStage`] for color sensors), and priors that need no network ([`Tv`], [`Wnnm`]).
+//! ([`Gap`], [`Admm`], [`TwoStage`] for color sensors), and priors that need no network ([`Tv`], [`Wavelet`], [`Wnnm`]).
 //!
 //! A solver never sees ground truth, files, networks or the clock; observers and the stop rule do.
 //!
@@ -21,7 +21,7 @@ pub use adapters::{
 pub use calibrate::{CalibrateError, Calibrated, Calibration, Exposure, Parameter};
 pub use calibrate::{Progress as CalibrationProgress, Watch as CalibrationWatch};
 pub use data_step::{DataStep, Progress, progress};
-pub use priors::{Call, Denoiser, Estimate, Prior, PriorError, Tv, Wnnm};
+pub use priors::{Call, Denoiser, Estimate, Prior, PriorError, Tv, Wavelet, Wnnm, WnnmParams};
 pub use run::{BackOff, HoldOut, IterInfo, Observer, Outcome, Plan, SolveError, Stage, StopReason, StopRule, run};
 pub use sci_forward::{self, BoxError};
 pub use solvers::{Admm, Convention, Gap, MomentumStart, Solver, TwoStage, TwoStageParams, WarmStart, XStep};

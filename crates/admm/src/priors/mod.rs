@@ -1,10 +1,12 @@
 //! The seam between a solver and what it plugs in as a prior, and the priors that need no network.
 
 mod tv;
+mod wavelet;
 mod wnnm;
 
 pub use tv::Tv;
-pub use wnnm::Wnnm;
+pub use wavelet::Wavelet;
+pub use wnnm::{Wnnm, WnnmParams};
 
 use crate::BoxError;
 use ndarray::parallel::prelude::*;

@@ -215,6 +215,10 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         json,
         written,
     };
+    let why = experiment.denoisers.iter().find_map(|denoiser| denoiser.part.against_tiles());
+    if let (Some(why), true) = (why, experiment.skip.is_some_and(|skip| skip.tiles)) {
+        return Err(source.error_at("skip.tiles", format!("`skip.tiles` is true, but {why}; legal: false")));
+    }
     experiment.set_recipe().map_err(|(key, problem)| source.error_at(key, format!("`{key}` {problem}")))?;
     experiment.begin_with_tv();
     Ok(experiment)

@@ -7,6 +7,7 @@ mod network;
 mod saving;
 mod shiftnet;
 mod tv;
+mod wavelet;
 mod wnnm;
 
 use std::fmt::Debug;
@@ -27,9 +28,8 @@ pub use saving::{MultiplyAdds, Saving, Work};
 pub use tv::first_of_all;
 
 /// Every denoiser.
-const DENOISERS: &[Entry] = &[tv::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, shiftnet::ENTRY];
-/// Those that are going to be.
-const NOT_YET: &[&str] = &["wavelet"];
+const DENOISERS: &[Entry] =
+    &[tv::ENTRY, wavelet::ENTRY, wnnm::ENTRY, ffdnet::ENTRY, fastdvdnet::ENTRY, shiftnet::ENTRY];
 
 /// A line of [`DENOISERS`].
 struct Entry {
@@ -55,11 +55,10 @@ pub struct Chosen {
 /// # Errors
 /// The first mistake.
 pub fn read(table: Table<'_>) -> Result<Chosen, ConfigError> {
-    let available: Vec<&str> = DENOISERS.iter().map(|entry| entry.kind).collect();
-    let legal = [&available, NOT_YET].concat();
+    let kinds: Vec<&str> = DENOISERS.iter().map(|entry| entry.kind).collect();
     let ((kind, part), json) = table.read(|t| {
-        let kind = t.kind(&legal, None)?;
-        let entry = DENOISERS.iter().find(|entry| entry.kind == kind).ok_or_else(|| t.not_yet(&available))?;
+        let kind = t.kind(&kinds, None)?;
+        let entry = DENOISERS.iter().find(|entry| entry.kind == kind).ok_or_else(|| t.not_yet(&kinds))?;
         Ok((entry.kind, (entry.read)(t)))
     })?;
     Ok(Chosen { kind, json, part })
@@ -80,6 +79,11 @@ pub trait Part: Debug + Send + Sync {
     /// Whether it can learn while it solves.
     fn adapts(&self) -> bool {
         false
+    }
+
+    /// Why it must be given the video as a whole (`[skip]`), if it must.
+    fn against_tiles(&self) -> Option<&'static str> {
+        None
     }
 
     /// What all measurements share of it, such as a loaded network.

@@ -9,37 +9,41 @@ use crate::table::Table;
 
 pub(super) const ENTRY: Entry = Entry { kind: "gap", read };
 
-/// `None` for plain GAP, else where y1 starts.
 #[derive(Debug)]
-struct Projection(Option<MomentumStart>);
+struct Projection {
+    /// `None` for plain GAP, else where y1 starts.
+    momentum: Option<MomentumStart>,
+    /// Whether y1 starts anew where σ falls by far, and where a prior with a σ follows one without.
+    restarts: bool,
+}
 
 fn read(t: &mut Table<'_>) -> Keys {
-    let momentum = if t.flag("accelerate", true) {
+    let (momentum, restarts) = if t.flag("accelerate", true) {
         let legal = [("zero", MomentumStart::Zero), ("measurement", MomentumStart::Measurement)];
-        Some(t.choice("momentum", &legal, MomentumStart::Measurement))
+        (Some(t.choice("momentum", &legal, MomentumStart::Measurement)), t.flag("restart", false))
     } else {
-        t.idle(&["momentum"], "solver.accelerate = true");
-        None
+        t.idle(&["momentum", "restart"], "solver.accelerate = true");
+        (None, false)
     };
-    Keys { method: Box::new(Projection(momentum)), start: Start::read(t), demosaicer: Demosaicer::read(t) }
+    Keys { method: Box::new(Projection { momentum, restarts }), start: Start::read(t), demosaicer: Demosaicer::read(t) }
 }
 
 impl Method for Projection {
     fn accelerated(&self) -> bool {
-        self.0.is_some()
+        self.momentum.is_some()
     }
 
     fn unrolled(&self) -> Option<bool> {
-        match self.0 {
+        match self.momentum {
             None => Some(false),
-            Some(MomentumStart::Measurement) => Some(true),
-            Some(MomentumStart::Zero) => None,
+            Some(MomentumStart::Measurement) if !self.restarts => Some(true),
+            Some(_) => None,
         }
     }
 
     /// From where TV ends nothing is left to make up for.
     fn begin_with_tv(&mut self, json: &mut Value) -> bool {
-        if let Some(momentum) = &mut self.0 {
+        if let Some(momentum) = &mut self.momentum {
             *momentum = MomentumStart::Measurement;
             json["momentum"] = "measurement".into();
         }
@@ -48,7 +52,7 @@ impl Method for Projection {
 
     fn advice(&self, backed_off: bool) -> &'static str {
         // What has backed off has already gone on without acceleration.
-        match self.0.filter(|_| !backed_off) {
+        match self.momentum.filter(|_| !backed_off) {
             None => "raise stage.0.sigma, or use another denoiser",
             Some(MomentumStart::Zero) => "set solver.momentum = \"measurement\"",
             Some(MomentumStart::Measurement) => "set solver.accelerate = false",
@@ -56,11 +60,11 @@ impl Method for Projection {
     }
 
     fn build<'p>(&self, priors: Priors<'p, '_>) -> anyhow::Result<Box<dyn admm::Solver + 'p>> {
-        let skips = priors.skips;
-        let gap = match self.0 {
+        let restarts = self.restarts || priors.skips;
+        let gap = match self.momentum {
             None => Gap::plain(priors.on_sensor()),
             Some(momentum) => Gap::with_momentum(priors.on_sensor(), momentum),
         };
-        Ok(Box::new(if skips { gap.restarting() } else { gap }))
+        Ok(Box::new(if restarts { gap.restarting() } else { gap }))
     }
 }
