@@ -13,7 +13,7 @@ use sci_cli::table::{Paths, Source, Table};
 use sci_forward::CfaPattern;
 
 use crate::arrays::{array, floats, out, row_major};
-use crate::failure::{Refused, callers, raised, refused};
+use crate::failure::{callers, raised, refused};
 use crate::settings;
 
 /// A denoiser of the program, for its solvers and for loops of your own: denoiser(noisy, sigma).
@@ -86,7 +86,7 @@ impl Denoiser {
             let mut clean = Array4::zeros(x.dim());
             let call = Call { sigma, iteration, ..Call::default() };
             let (mut built, mut saving) = (self.lock(), Saving::default());
-            on_frames(built.as_mut(), &mut saving)?.denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
+            built.on_frames(&mut saving).denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
             anyhow::Ok(clean)
         });
         let clean = clean.map_err(raised)?.into_shape_with_order(IxDyn(&shape));
@@ -112,8 +112,7 @@ impl Denoiser {
         let work = MultiplyAdds::default();
         let cfa = color.then(CfaPattern::default);
         let built = chosen.part.build(&Site { cfa, adapt: Default::default(), work: &work });
-        let mut built = built.map_err(callers)?;
-        on_frames(built.as_mut(), &mut Saving::default())?;
+        let built = built.map_err(callers)?;
         let has_sigma = chosen.part.instead_of_sigma().is_none();
         Ok(Self { kind: chosen.kind, color, has_sigma, built: Arc::new(Mutex::new(built)) })
     }
@@ -138,12 +137,6 @@ impl Denoiser {
         // What a panic left is overwritten by the next call.
         self.built.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// What works on frames alone.
-fn on_frames<'p>(built: &'p mut dyn Built, saving: &mut Saving) -> anyhow::Result<Box<dyn admm::Denoiser + 'p>> {
-    let why = "this denoiser works on the measurement instead of on frames: it runs in sci.reconstruct only";
-    Ok(built.on_frames(saving).ok_or_else(|| Refused(why.into()))?)
 }
 
 fn boxed(error: BoxError) -> anyhow::Error {
@@ -189,7 +182,8 @@ impl Plugged {
         match self {
             Self::Ours(ours) => {
                 let mut built = ours.get().lock();
-                let mut denoiser = on_frames(built.as_mut(), &mut Saving::default())?;
+                let mut saving = Saving::default();
+                let mut denoiser = built.on_frames(&mut saving);
                 solve(denoiser.as_mut())
             }
             Self::Callable(callable) => solve(&mut Callable(callable)),

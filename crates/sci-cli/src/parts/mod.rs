@@ -123,8 +123,8 @@ impl Site<'_> {
 
 /// A part as far as it can be shared by all measurements.
 pub trait Built: Send {
-    /// On gray or RGB video as it is; nothing if it does not work on frames alone.
-    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>>;
+    /// On gray or RGB video as it is.
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Box<dyn Denoiser + 'p>;
 
     /// On what the sensor sees.
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p>;

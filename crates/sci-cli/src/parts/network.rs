@@ -69,8 +69,8 @@ struct Running<N> {
 }
 
 impl<N: Network + Denoiser + Clone> Built for Running<N> {
-    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>> {
-        Some(saving.network(&mut self.net, &self.inference, self.multiply_adds))
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Box<dyn Denoiser + 'p> {
+        saving.network(&mut self.net, &self.inference, self.multiply_adds)
     }
 
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p> {

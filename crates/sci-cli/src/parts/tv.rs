@@ -41,8 +41,8 @@ impl Part for Tv {
 
 /// Made anew for each measurement, as it carries state from call to call.
 impl Built for Tv {
-    fn on_frames<'p>(&'p mut self, _saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>> {
-        Some(Box::new(admm::Tv::new(self.weight).inner(self.inner)))
+    fn on_frames<'p>(&'p mut self, _saving: &mut Saving) -> Box<dyn Denoiser + 'p> {
+        Box::new(admm::Tv::new(self.weight).inner(self.inner))
     }
 
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, _saving: &mut Saving) -> Box<dyn Prior + 'p> {

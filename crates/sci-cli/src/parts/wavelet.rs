@@ -25,8 +25,8 @@ impl Part for Threshold {
 }
 
 impl Built for Threshold {
-    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>> {
-        Some(saving.tiles(self.0))
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Box<dyn Denoiser + 'p> {
+        saving.tiles(self.0)
     }
 
     /// As TV: a color sensor's sub-lattices are gray videos, which leaves nothing to a demosaicer's mistakes.

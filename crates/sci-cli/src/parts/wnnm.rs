@@ -41,8 +41,8 @@ impl Part for LowRank {
 
 /// Made anew for each measurement, as it carries groups from call to call.
 impl Built for LowRank {
-    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Option<Box<dyn Denoiser + 'p>> {
-        Some(saving.tiles(Wnnm::new(self.params)))
+    fn on_frames<'p>(&'p mut self, saving: &mut Saving) -> Box<dyn Denoiser + 'p> {
+        saving.tiles(Wnnm::new(self.params))
     }
 
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p> {

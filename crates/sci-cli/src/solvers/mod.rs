@@ -8,7 +8,6 @@ mod two_stage;
 use std::fmt::Debug;
 
 use ::admm::{Denoiser, PerStage, Prior};
-use anyhow::Context;
 use serde_json::Value;
 
 use crate::parts::{Built, Demosaicer, Saving, Sensor};
@@ -149,10 +148,9 @@ impl<'p> Priors<'p, '_> {
     }
 
     /// On RGB video as it is.
-    fn on_frames(self) -> anyhow::Result<PerStage<dyn Denoiser + 'p>> {
+    fn on_frames(self) -> PerStage<dyn Denoiser + 'p> {
         let Self { built, of_stage, saving, .. } = self;
-        let denoisers: Option<Vec<_>> = built.iter_mut().map(|part| part.on_frames(saving)).collect();
-        let denoisers = denoisers.context("a denoiser does not work on frames alone, as this solver needs")?;
-        Ok(PerStage::<dyn Denoiser + 'p>::new(denoisers, of_stage))
+        let denoisers = built.iter_mut().map(|part| part.on_frames(saving)).collect();
+        PerStage::<dyn Denoiser + 'p>::new(denoisers, of_stage)
     }
 }

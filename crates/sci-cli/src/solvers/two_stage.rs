@@ -56,6 +56,6 @@ impl Method for TwoStages {
     fn build<'p>(&self, priors: Priors<'p, '_>) -> anyhow::Result<Box<dyn admm::Solver + 'p>> {
         let sensor = priors.color.context("solver.kind = \"two-stage\" is for color sensors")?;
         let (demosaicer, cfa) = (sensor.demosaicer.clone(), sensor.cfa);
-        Ok(Box::new(TwoStage::new(priors.on_frames()?, demosaicer, self.x_step, cfa, self.params)))
+        Ok(Box::new(TwoStage::new(priors.on_frames(), demosaicer, self.x_step, cfa, self.params)))
     }
 }
