@@ -14,7 +14,8 @@ const BUNDLED: &[(&str, &[u8])] = bundled![
     "fastdvdnet_gray_sci",
     "ddnet",
     "fastdvdnet_color",
-    "fastdvdnet_color_sci"
+    "fastdvdnet_color_sci",
+    "shiftnet_gray_sci"
 ];
 
 /// The names that `bundled:NAME` knows.
