@@ -40,12 +40,11 @@ def test_mistakes_are_value_errors():
     net = sci.Denoiser("ffdnet", weights="bundled:ffdnet_gray")
     frames = np.zeros((2, 16, 16), np.float32)
     for call, part in [
-        (lambda: sci.Denoiser("bm3d"), '`denoiser.kind` = "bm3d" is not legal; legal: tv, wnnm'),
+        (lambda: sci.Denoiser("bm3d"), '`denoiser.kind` = "bm3d" is not legal; legal: tv, wavelet, wnnm'),
         (lambda: sci.Denoiser("tv", weigth=1), "weigth"),
         (lambda: sci.Denoiser("tv", weight=-1), "^`denoiser.weight` = -1 is not legal; legal: a number from"),
         (lambda: sci.Denoiser("ffdnet"), "`denoiser.weights` is missing"),
         (lambda: sci.Denoiser("ffdnet", weights="bundled:none"), "bundled are bundled:"),
-        (lambda: sci.Denoiser("unfolding", weights="bundled:unfolding_gray"), "works on the measurement"),
         (lambda: net(frames), "needs sigma"),
         (lambda: net(frames, 25), "legal: 0 to 1"),
         (lambda: net(frames[0], 0.1), r"`noisy` has shape \[16, 16\], expected \[T, 1, H, W\] or \[T, H, W\]"),
