@@ -122,19 +122,28 @@ fn ssim_with(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>, taps: &
     if reference.nrows() < taps.len() || reference.ncols() < taps.len() {
         return f64::NAN;
     }
-    let (a, b) = (reference.mapv(f64::from), image.mapv(f64::from));
-    let filter = |v: Array2<f64>| filter_valid(&v, taps);
-    let (mean_a, mean_b) = (filter(a.clone()), filter(b.clone()));
-    let (aa, bb, ab) = (filter(&a * &a), filter(&b * &b), filter(&a * &b));
-    let sum = Zip::from(&mean_a).and(&mean_b).and(&aa).and(&bb).and(&ab).fold(0.0, |sum, &ma, &mb, &aa, &bb, &ab| {
-        let variance_a = covariance_norm * (aa - ma * ma);
-        let variance_b = covariance_norm * (bb - mb * mb);
-        let covariance = covariance_norm * (ab - ma * mb);
-        sum + (2.0 * ma * mb + C1) * (2.0 * covariance + C2)
-            / ((ma * ma + mb * mb + C1) * (variance_a + variance_b + C2))
-    });
-    sum / mean_a.len() as f64
+    let (height, width) = (reference.nrows() + 1 - taps.len(), reference.ncols() + 1 - taps.len());
+    let mut sum = 0.0;
+    for first in (0..height).step_by(STRIP) {
+        let rows = s![first..(first + STRIP).min(height) + taps.len() - 1, ..];
+        let (a, b) = (reference.slice(rows).mapv(f64::from), image.slice(rows).mapv(f64::from));
+        let filter = |v: &Array2<f64>| filter_valid(v, taps);
+        let (mean_a, mean_b) = (filter(&a), filter(&b));
+        let (aa, bb, ab) = (filter(&(&a * &a)), filter(&(&b * &b)), filter(&(&a * &b)));
+        // From strip to strip the terms are added in the order of the whole.
+        sum = Zip::from(&mean_a).and(&mean_b).and(&aa).and(&bb).and(&ab).fold(sum, |sum, &ma, &mb, &aa, &bb, &ab| {
+            let variance_a = covariance_norm * (aa - ma * ma);
+            let variance_b = covariance_norm * (bb - mb * mb);
+            let covariance = covariance_norm * (ab - ma * mb);
+            sum + (2.0 * ma * mb + C1) * (2.0 * covariance + C2)
+                / ((ma * ma + mb * mb + C1) * (variance_a + variance_b + C2))
+        });
+    }
+    sum / (height * width) as f64
 }
+
+/// Rows of the map of SSIM that are made at once: what they need stays in the cache.
+const STRIP: usize = 16;
 
 /// The separable filter `taps ⊗ taps` where it lies inside the image.
 fn filter_valid(image: &Array2<f64>, taps: &[f64]) -> Array2<f64> {
