@@ -8,7 +8,7 @@
 //! Tassano, Delon, Veit, *FastDVDnet: towards real-time deep video denoising without flow estimation*, CVPR 2020.
 
 use crate::layers::{Conv, Source};
-use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, denoise_clip};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::WeightFile;
 use crate::{Architecture, Error, Result};
@@ -221,18 +221,6 @@ impl Denoiser for Fastdvdnet {
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        let sigma = call.required_sigma()?;
-        check_video(self, sigma, noisy, &out)?;
-        if noisy.is_empty() {
-            return Ok(());
-        }
-        let device = self.device();
-        if device.is_cpu() {
-            self.net.infer(noisy, sigma, out)?;
-        } else {
-            let clean = self.forward(&to_tensor(noisy, &device)?, &[sigma])?;
-            copy_to(&clean, out).map_err(Error::from)?;
-        }
-        Ok(())
+        denoise_clip(self, call, noisy, out, |net, noisy, sigma, out| net.net.infer(noisy, sigma, out))
     }
 }

@@ -12,7 +12,7 @@
 //! Zhang, Zuo, Zhang, *FFDNet: toward a fast and flexible solution for CNN based image denoising*, 2018.
 //! Tassano, Delon, Veit, *An analysis and implementation of the FFDNet image denoising method*, IPOL 2019.
 
-use crate::infer::{Cache, channel_row, set_channel};
+use crate::infer::{Cache, join_phases, set_channel, set_phases};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source, chain};
 use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
@@ -21,7 +21,7 @@ use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
-use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis, s};
+use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
@@ -178,7 +178,7 @@ impl Ffdnet {
     }
 
     /// One frame `[C, H, W]` without a tensor in the loop.
-    fn infer_frame(&mut self, frame: ArrayView3<'_, f32>, sigma: f32, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+    fn infer_frame(&mut self, frame: ArrayView3<'_, f32>, sigma: f32, out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let residual = matches!(self.spec.layout, FfdnetLayout::Residual { .. });
         let (c, h, w) = frame.dim();
         let (half_h, half_w) = (h.div_ceil(2), w.div_ceil(2));
@@ -187,26 +187,9 @@ impl Ffdnet {
         engine.start(half_h, half_w);
         let mut z = engine.image(4 * c + 1, half_h, half_w);
         set_channel(&mut z, if residual { 0 } else { 4 * c }, |_| std::iter::repeat(sigma));
-        for channel in 0..4 * c {
-            let (color, i, j) = (channel / 4, channel / 2 % 2, channel % 2);
-            let at = |i, n| Padding::Replicate.source(i, n);
-            set_channel(&mut z, channel + usize::from(residual), |y| {
-                let row = frame.slice(s![color, at(2 * y + i, h), ..]);
-                (0..half_w).map(move |x| row[at(2 * x + j, w)])
-            });
-        }
+        set_phases(&mut z, usize::from(residual), frame, Padding::Replicate, 0.0);
         let z = engine.chain(0..self.spec.depth, z)?;
-        for (channel, y) in (0..4 * c).flat_map(|channel| (0..half_h).map(move |y| (channel, y))) {
-            let (color, i, j) = (channel / 4, channel / 2 % 2, channel % 2);
-            if 2 * y + i == h {
-                continue;
-            }
-            let columns = s![color, 2 * y + i, j..;2];
-            let noisy = frame.slice(columns);
-            for ((out, noisy), value) in out.slice_mut(columns).iter_mut().zip(noisy).zip(channel_row(&z, channel, y)) {
-                *out = if residual { noisy - value } else { value };
-            }
-        }
+        join_phases(&z, frame, out, |noisy, found| if residual { noisy - found } else { found });
         engine.recycle(z);
         Ok(())
     }

@@ -4,6 +4,8 @@
 use crate::Result;
 use crate::kernels::{Blocked, Conv3x3, Form, Isa, LANES, PackedConv, Precision, Scratch, shuffle};
 use crate::layers::Conv;
+use crate::network::Padding;
+use ndarray::{ArrayView3, ArrayViewMut3, s};
 
 /// Packed convolutions and the images between them.
 #[derive(Debug, Default)]
@@ -204,6 +206,48 @@ pub(crate) fn set_channel<I: IntoIterator<Item = f32>>(image: &mut Blocked, chan
             pixel[channel % LANES] = value;
         }
     }
+}
+
+/// Phases of an image of one channel: its 2×2 pixels as channels.
+pub(crate) const PHASES: usize = 4;
+
+/// Writes the phases of a frame `[C, H, W]`, less `black`, into channels from `first`; beyond its edge it goes on by `padding`.
+pub(crate) fn set_phases(image: &mut Blocked, first: usize, frame: ArrayView3<'_, f32>, padding: Padding, black: f32) {
+    let ((channels, height, width), (_, _, half_w)) = (frame.dim(), image.shape());
+    for channel in 0..PHASES * channels {
+        let (color, i, j) = place(channel);
+        set_channel(image, first + channel, |y| {
+            let row = frame.slice(s![color, padding.source(2 * y + i, height), ..]);
+            (0..half_w).map(move |x| row[padding.source(2 * x + j, width)] - black)
+        });
+    }
+}
+
+/// Makes each pixel of `out` of that of `frame`, both `[C, H, W]`, and what was found for it in its phase.
+pub(crate) fn join_phases(
+    found: &Blocked,
+    frame: ArrayView3<'_, f32>,
+    mut out: ArrayViewMut3<'_, f32>,
+    join: impl Fn(f32, f32) -> f32,
+) {
+    let ((channels, height, _), (_, half_h, _)) = (frame.dim(), found.shape());
+    for (channel, y) in (0..PHASES * channels).flat_map(|channel| (0..half_h).map(move |y| (channel, y))) {
+        let (color, i, j) = place(channel);
+        if 2 * y + i >= height {
+            continue;
+        }
+        let columns = s![color, 2 * y + i, j..;2];
+        let pixels = frame.slice(columns);
+        for ((out, &pixel), found) in out.slice_mut(columns).iter_mut().zip(pixels).zip(channel_row(found, channel, y))
+        {
+            *out = join(pixel, found);
+        }
+    }
+}
+
+/// Color, row and column of a phase.
+fn place(channel: usize) -> (usize, usize, usize) {
+    (channel / PHASES, channel / 2 % 2, channel % 2)
 }
 
 /// One row of one channel.

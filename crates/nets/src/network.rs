@@ -263,6 +263,29 @@ pub(crate) fn check_video(
     Ok(())
 }
 
+/// [`admm::Denoiser::denoise`] of a network that takes whole clips: `on_cpu` where its tensors are there, else its graph.
+pub(crate) fn denoise_clip<N: Network>(
+    net: &mut N,
+    call: &Call<'_>,
+    noisy: ArrayView4<'_, f32>,
+    out: ArrayViewMut4<'_, f32>,
+    on_cpu: impl FnOnce(&mut N, ArrayView4<'_, f32>, f32, ArrayViewMut4<'_, f32>) -> Result<(), Error>,
+) -> Result<(), BoxError> {
+    let sigma = call.required_sigma()?;
+    check_video(net, sigma, noisy, &out)?;
+    if noisy.is_empty() {
+        return Ok(());
+    }
+    let device = net.device();
+    if device.is_cpu() {
+        on_cpu(net, noisy, sigma, out)?;
+    } else {
+        let clean = net.forward(&to_tensor(noisy, &device).map_err(Error::from)?, &[sigma])?;
+        copy_to(&clean, out).map_err(Error::from)?;
+    }
+    Ok(())
+}
+
 /// Frames as a tensor on `device`.
 pub(crate) fn to_tensor(frames: ArrayView4<'_, f32>, device: &Device) -> candle_core::Result<Tensor> {
     let shape = frames.dim();

@@ -9,7 +9,7 @@
 //! *Real-time streaming video denoising with bidirectional buffers*, ACM MM 2022 (the shift in video restoration).
 
 use super::temporal_shift::TemporalShift;
-use crate::infer::Engine;
+use crate::infer::{Engine, PHASES};
 use crate::kernels::{Blocked, Conv3x3, LANES};
 use crate::layers::{Conv, Shift, Source, chain};
 use crate::weights::WeightFile;
@@ -24,8 +24,6 @@ const LEVELS: usize = 3;
 pub(crate) const MULTIPLE: usize = 2 << (LEVELS - 1);
 /// What the names of all tensors begin with.
 const PREFIX: &str = "body.";
-/// Phases of an image of one channel.
-pub(crate) const PHASES: usize = 4;
 
 /// Its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -256,7 +254,7 @@ fn add_block(engine: &mut Engine, first: usize, h: &mut [Blocked]) -> Result<()>
 
 /// [`TemporalShift`] of one frame.
 fn shift(image: &mut Blocked, before: Option<&Blocked>, now: &Blocked, after: Option<&Blocked>) {
-    let each_way = TemporalShift::of(now.shape().0, 0).each_way;
+    let each_way = TemporalShift::each_way(now.shape().0);
     for block in 0..image.blocks() {
         let lanes = |from: usize| {
             let [from, to] =

@@ -12,17 +12,17 @@
 mod body;
 mod temporal_shift;
 
-use body::{Body, MULTIPLE, PHASES};
+use body::{Body, MULTIPLE};
 
-use crate::infer::{Cache, channel_row, set_channel};
+use crate::infer::{Cache, PHASES, join_phases, set_channel, set_phases};
 use crate::layers::{Conv, Source};
-use crate::network::{Layers, Network, Padding, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
+use crate::network::{Layers, Network, Padding, check_clips, crop, denoise_clip, noise_map};
 use crate::weights::WeightFile;
 use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
-use ndarray::{ArrayView4, ArrayViewMut4, Axis, s};
+use ndarray::{ArrayView4, ArrayViewMut4, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
@@ -137,34 +137,16 @@ impl Shiftnet {
         let mut features = Vec::with_capacity(clip.len_of(Axis(0)));
         for frame in clip.outer_iter() {
             let mut shown = engine.image(body.ends.0, half_h, half_w);
-            for channel in 0..PHASES * channels {
-                let (color, i, j) = (channel / PHASES, channel / 2 % 2, channel % 2);
-                set_channel(&mut shown, channel, |y| {
-                    let row = frame.slice(s![color, Padding::Reflect.source(2 * y + i, height), ..]);
-                    (0..half_w).map(move |x| row[Padding::Reflect.source(2 * x + j, width)] - GRAY)
-                });
-            }
+            set_phases(&mut shown, 0, frame, Padding::Reflect, GRAY);
             set_channel(&mut shown, PHASES * channels, |_| std::iter::repeat(sigma));
             features.push(engine.conv(0, &shown)?);
             engine.recycle(shown);
         }
         let features = body.between(engine, features)?;
-        for ((features, frame), mut out) in features.into_iter().zip(clip.outer_iter()).zip(out.outer_iter_mut()) {
+        for ((features, frame), out) in features.into_iter().zip(clip.outer_iter()).zip(out.outer_iter_mut()) {
             let found = engine.conv(convs.len() - 1, &features)?;
             engine.recycle(features);
-            for (channel, y) in (0..PHASES * channels).flat_map(|c| (0..half_h).map(move |y| (c, y))) {
-                let (color, i, j) = (channel / PHASES, channel / 2 % 2, channel % 2);
-                if 2 * y + i < height {
-                    let columns = s![color, 2 * y + i, j..;2];
-                    let noisy = frame.slice(columns);
-                    let found = channel_row(&found, channel, y);
-                    out.slice_mut(columns)
-                        .iter_mut()
-                        .zip(noisy)
-                        .zip(found)
-                        .for_each(|((out, x), found)| *out = x + found);
-                }
-            }
+            join_phases(&found, frame, out, |noisy, found| noisy + found);
             engine.recycle(found);
         }
         Ok(())
@@ -228,26 +210,15 @@ impl Denoiser for Shiftnet {
         noisy: ArrayView4<'_, f32>,
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
-        let sigma = call.required_sigma()?;
-        check_video(self, sigma, noisy, &out)?;
-        if noisy.is_empty() {
-            return Ok(());
-        }
-        let device = self.device();
-        if device.is_cpu() {
-            self.infer_clip(noisy, sigma, out)?;
-        } else {
-            let clean = self.forward(&to_tensor(noisy, &device)?, &[sigma])?;
-            copy_to(&clean, out).map_err(Error::from)?;
-        }
-        Ok(())
+        denoise_clip(self, call, noisy, out, Self::infer_clip)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::{Array4, concatenate};
+    use crate::network::{copy_to, to_tensor};
+    use ndarray::{Array4, concatenate, s};
     use rand::RngExt;
 
     /// A network no layer of which is silent.

@@ -5,11 +5,11 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor, WithDType};
 /// One of so many channels is taken from the frame before, and one from the frame after.
 const SHIFTED: usize = 4;
 
-/// Of images `[N, C, H, W]`, clips of equal length one after another, each in order of time: the first channels of each from the frame before, as many from the frame after, the others
-/// its own. Zeros beyond the ends of a clip.
+/// Of images `[N, C, H, W]`, clips of equal length one after another, each in order of time: the first channels of each from the frame before, as
+/// many from the frame after, the others its own. Zeros beyond the ends of a clip.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TemporalShift {
-    pub(super) each_way: usize,
+    each_way: usize,
     /// Of a clip.
     frames: usize,
     /// The adjoint: from the frame after first.
@@ -18,7 +18,12 @@ pub(super) struct TemporalShift {
 
 impl TemporalShift {
     pub(super) fn of(channels: usize, frames: usize) -> Self {
-        Self { each_way: channels / SHIFTED, frames, back: false }
+        Self { each_way: Self::each_way(channels), frames, back: false }
+    }
+
+    /// Of so many channels those that are taken from the frame before, and as many from the one after.
+    pub(super) fn each_way(channels: usize) -> usize {
+        channels / SHIFTED
     }
 
     /// Which image channel `c` of image `n` is taken from.

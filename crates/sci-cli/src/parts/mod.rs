@@ -55,10 +55,8 @@ pub struct Chosen {
 /// # Errors
 /// The first mistake.
 pub fn read(table: Table<'_>) -> Result<Chosen, ConfigError> {
-    let kinds: Vec<&str> = DENOISERS.iter().map(|entry| entry.kind).collect();
     let ((kind, part), json) = table.read(|t| {
-        let kind = t.kind(&kinds, None)?;
-        let entry = DENOISERS.iter().find(|entry| entry.kind == kind).ok_or_else(|| t.not_yet(&kinds))?;
+        let entry = t.entry(DENOISERS, |entry| entry.kind)?;
         Ok((entry.kind, (entry.read)(t)))
     })?;
     Ok(Chosen { kind, json, part })

@@ -31,16 +31,11 @@ pub struct Inference {
 pub const PRECISIONS: [(&str, Precision); 2] = [("f32", Precision::F32), ("bf16", Precision::Bf16)];
 
 impl Inference {
-    /// Of a network that may see the video any way round.
+    /// From the table of a denoiser.
     pub(super) fn read(t: &mut Table<'_>) -> Self {
         let (flips, dim) = (t.flag("flips", false), t.number("dim", 1.0, 0.1..=100.0) as f32);
-        Self { flips, dim, ..Self::read_upright(t) }
-    }
-
-    /// Of a network that must see the video as the sensor did.
-    pub(super) fn read_upright(t: &mut Table<'_>) -> Self {
         let precision = t.choice("precision", &PRECISIONS, Precision::default());
-        Self { precision, flips: false, dim: 1.0, weights: t.weights("weights") }
+        Self { precision, flips, dim, weights: t.weights("weights") }
     }
 
     /// Whether it was trained for the iterates of one schedule.

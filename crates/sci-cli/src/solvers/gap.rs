@@ -29,10 +29,6 @@ fn read(t: &mut Table<'_>) -> Keys {
 }
 
 impl Method for Projection {
-    fn accelerated(&self) -> bool {
-        self.momentum.is_some()
-    }
-
     fn unrolled(&self) -> Option<bool> {
         match self.momentum {
             None => Some(false),

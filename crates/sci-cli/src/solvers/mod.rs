@@ -53,10 +53,8 @@ pub struct Solver {
 /// # Errors
 /// The first mistake.
 pub fn read(table: Table<'_>) -> Result<Solver, ConfigError> {
-    let kinds: Vec<&str> = SOLVERS.iter().map(|entry| entry.kind).collect();
     let ((kind, keys), json) = table.read(|t| {
-        let kind = t.kind(&kinds, None)?;
-        let entry = SOLVERS.iter().find(|entry| entry.kind == kind).ok_or_else(|| t.not_yet(&kinds))?;
+        let entry = t.entry(SOLVERS, |entry| entry.kind)?;
         Ok((entry.kind, (entry.read)(t)))
     })?;
     let Keys { method, start, demosaicer } = keys;
@@ -93,11 +91,6 @@ impl Solver {
 pub trait Method: Debug + Send + Sync {
     /// Whether it is for color sensors only.
     fn color_only(&self) -> bool {
-        false
-    }
-
-    /// Whether it goes beyond the projection onto the measurement.
-    fn accelerated(&self) -> bool {
         false
     }
 

@@ -291,24 +291,30 @@ impl<'s> Table<'s> {
     /// # Errors
     /// If it is none of them, or missing and there is no default.
     pub fn kind<'k>(&mut self, legal: &[&'k str], default: Option<&'k str>) -> Result<&'k str, ConfigError> {
-        let key = self.key_of("kind");
-        let kind = match self.take("kind") {
-            None => default.ok_or_else(|| self.error(format!("`{key}` is missing; legal: {}", legal.join(", "))))?,
-            Some(value) => {
-                let found = legal.iter().find(|kind| value.get_ref().as_str() == Some(kind));
-                *found.ok_or_else(|| self.source.not_legal(&value.span(), &key, &legal.join(", ")))?
-            }
-        };
-        self.show("kind", kind);
-        Ok(kind)
+        Ok(legal[self.which_kind(legal, default)?])
     }
 
-    /// An error about a `kind` that there is going to be.
-    pub fn not_yet(&self, available: &[&str]) -> ConfigError {
-        let span = self.place_of("kind").unwrap_or_else(|| self.span.clone());
-        let (key, value) = (self.key_of("kind"), self.source.snippet(&span));
-        let available = available.join(", ");
-        self.source.error(&span, format!("`{key}` = {value} is not available yet; available: {available}"))
+    /// The entry of a list of all kinds whose `name` is the table's `kind`.
+    ///
+    /// # Errors
+    /// As [`Table::kind`].
+    pub fn entry<'e, E>(&mut self, entries: &'e [E], name: impl Fn(&E) -> &'static str) -> Result<&'e E, ConfigError> {
+        let kinds: Vec<&str> = entries.iter().map(name).collect();
+        Ok(&entries[self.which_kind(&kinds, None)?])
+    }
+
+    fn which_kind(&mut self, legal: &[&str], default: Option<&str>) -> Result<usize, ConfigError> {
+        let key = self.key_of("kind");
+        let of = |name: Option<&str>| legal.iter().position(|kind| name == Some(kind));
+        let which = match self.take("kind") {
+            None => {
+                of(default).ok_or_else(|| self.error(format!("`{key}` is missing; legal: {}", legal.join(", "))))?
+            }
+            Some(value) => of(value.get_ref().as_str())
+                .ok_or_else(|| self.source.not_legal(&value.span(), &key, &legal.join(", ")))?,
+        };
+        self.show("kind", legal[which]);
+        Ok(which)
     }
 
     /// A table in this one.

@@ -4,29 +4,18 @@
 macro_rules! by_side {
     ($side:expr, |$name:ident| $work:block) => {
         match $side {
-            6 => {
-                #[allow(non_upper_case_globals)]
-                const $name: usize = 6;
-                $work
-            }
-            7 => {
-                #[allow(non_upper_case_globals)]
-                const $name: usize = 7;
-                $work
-            }
-            8 => {
-                #[allow(non_upper_case_globals)]
-                const $name: usize = 8;
-                $work
-            }
-            9 => {
-                #[allow(non_upper_case_globals)]
-                const $name: usize = 9;
-                $work
-            }
+            6 => by_side!(6, $name, $work),
+            7 => by_side!(7, $name, $work),
+            8 => by_side!(8, $name, $work),
+            9 => by_side!(9, $name, $work),
             $name => $work,
         }
     };
+    ($side:literal, $name:ident, $work:block) => {{
+        #[allow(non_upper_case_globals)]
+        const $name: usize = $side;
+        $work
+    }};
 }
 
 mod groups;
