@@ -83,14 +83,7 @@ impl<'e> Factory<'e> {
         let done: Vec<usize> = self.learning().map(|(net, _)| net.updates().len()).collect();
         let plan = task.as_ref().map_or_else(|| self.plan.clone(), |task| task.plan(&self.plan));
         let mut warm = self.warm_start_prior();
-        let normal = match (self.experiment.solver.start, &mut warm, previous) {
-            (solvers::Start::Adjoint, ..) => Start::Adjoint,
-            (solvers::Start::Tv { iterations, .. }, Some(prior), _) => {
-                Start::Warm { prior: prior.as_mut(), stage: admm::Stage { sigma: None, iterations } }
-            }
-            (solvers::Start::Previous, _, Some(video)) => Start::From(video),
-            _ => Start::Mean,
-        };
+        let normal = self.normal_start(&mut warm, previous);
         let start = match &task {
             Some(task) => task.start(normal),
             None => normal,
@@ -112,6 +105,34 @@ impl<'e> Factory<'e> {
             split,
         });
         Ok(Solved { outcome, planned: plan.iterations(), work, adaptation })
+    }
+
+    /// Solves the only measurement of a scene with networks as they are: a band beside one that they have learned from.
+    ///
+    /// # Errors
+    /// What [`admm::run`] reports.
+    pub fn solve_as_learned(&mut self, scene: &Scene, observer: &mut dyn Follow) -> anyhow::Result<Solved> {
+        let (measurement, plan) = (scene.measurement(0)?, self.plan.clone());
+        let mut warm = self.warm_start_prior();
+        let start = self.normal_start(&mut warm, None);
+        let (outcome, work) = self.run(&measurement, start, &plan, observer)?;
+        Ok(Solved { outcome, planned: plan.iterations(), work, adaptation: None })
+    }
+
+    /// Where a solve begins of which nothing else is known.
+    fn normal_start<'s>(
+        &self,
+        warm: &'s mut Option<Box<dyn Prior>>,
+        previous: Option<ArrayView3<'s, f32>>,
+    ) -> Start<'s> {
+        match (self.experiment.solver.start, warm, previous) {
+            (solvers::Start::Adjoint, ..) => Start::Adjoint,
+            (solvers::Start::Tv { iterations, .. }, Some(prior), _) => {
+                Start::Warm { prior: prior.as_mut(), stage: admm::Stage { sigma: None, iterations } }
+            }
+            (solvers::Start::Previous, _, Some(video)) => Start::From(video),
+            _ => Start::Mean,
+        }
     }
 
     /// What is known of a measurement from those before, where networks adapt; all of them turn to it.

@@ -3,6 +3,7 @@
 //! `main.rs` only parses arguments and turns the result into an exit code. Errors are typed up to the commands; the
 //! chain is printed once, in `main`.
 
+pub mod bands;
 pub mod calibration;
 pub mod commands;
 pub mod config;

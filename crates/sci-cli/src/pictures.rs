@@ -6,12 +6,14 @@ use std::sync::mpsc::{Receiver, sync_channel};
 
 use admm::Estimate;
 use anyhow::Context;
-use ndarray::{ArrayView4, Axis};
+use ndarray::{Array4, ArrayView4, Axis, concatenate};
 
+use crate::bands::frame_of;
 use crate::config::Output;
 use crate::io::output::{WriteError, write_atomically};
-use crate::io::scene::Scene;
+use crate::io::scene::{Banded, Scene};
 use crate::io::{frames, video};
+use crate::report;
 use crate::report::pictures::{MeasurementImages, Pictures};
 use crate::run_folder::{Finished, read_video};
 
@@ -111,6 +113,67 @@ impl Studio<'_> {
         })
     }
 
+    /// The pictures of a measurement that is too large for memory, a frame at a time: preview and page show it smaller.
+    ///
+    /// # Errors
+    /// That of the pictures, or of the scene.
+    pub fn make_by_frames(
+        output: &Output,
+        report_bytes: usize,
+        scene: &Banded,
+        finished: &Finished,
+        shape: [usize; 4],
+    ) -> anyhow::Result<()> {
+        let (index, path) = (finished.record.index, finished.video());
+        if !(output.frames || output.preview || output.report) {
+            return Ok(());
+        }
+        finished.make_pictures(|dir| {
+            let fail = |e: anyhow::Error| WriteError::new(dir, e);
+            let (mut small, mut truth, mut psnr_db) = (Vec::new(), Vec::new(), Vec::new());
+            for t in 0..shape[0] {
+                let frame = frame_of(&path, shape, t).map_err(|e| WriteError::new(&path, e))?;
+                if output.frames {
+                    let png = frames::png(frame.view()).map_err(|e| WriteError::new(dir, e))?;
+                    fs::write(dir.join(frame_name(index, t)), png).map_err(|e| WriteError::new(dir, e))?;
+                }
+                if output.report
+                    && let Some(whole) = scene.truth_frame(index, t).map_err(|e| fail(e.into()))?
+                {
+                    let whole = whole.seen(scene.cfa);
+                    let shown = whole.1.unwrap_or_else(|| whole.0.insert_axis(Axis(1)));
+                    psnr_db.push(report::pictures::psnr(shown.index_axis(Axis(0), 0), frame.view()));
+                    truth.push(frames::shrunk(shown.view(), PREVIEW_SIDE));
+                }
+                small.push(frames::shrunk(frame.insert_axis(Axis(0)).view(), PREVIEW_SIDE));
+            }
+            let joined = |videos: &[Array4<f32>]| {
+                let views: Vec<_> = videos.iter().map(|video| video.view()).collect();
+                concatenate(Axis(0), &views).map_err(|e| fail(e.into()))
+            };
+            let small = joined(&small)?;
+            if output.preview {
+                write_atomically(&dir.join(PREVIEW), |w| video::write_gif(w, small.view(), output.fps))?;
+            }
+            if output.report {
+                let y = scene.y(index).map_err(|e| fail(e.into()))?.insert_axis(Axis(0)).insert_axis(Axis(0));
+                let y = frames::shrunk(y.view(), PREVIEW_SIDE);
+                let truth = if truth.is_empty() { None } else { Some(joined(&truth)?) };
+                let images = MeasurementImages {
+                    measurement: Some(y.index_axis(Axis(0), 0).index_axis_move(Axis(0), 0)),
+                    recon: small.view(),
+                    cfa: None,
+                    truth: truth.as_ref().map(|truth| truth.view()),
+                };
+                let factor = shape[2].max(shape[3]) / frames::longer_side(small.view());
+                let pictures = Pictures::of(&images, None, report_bytes).map_err(|e| WriteError::new(dir, e))?;
+                save(&dir.join(PIECE), &pictures.of_larger(factor, &psnr_db))?;
+            }
+            Ok(())
+        })?;
+        Ok(())
+    }
+
     /// Each frame as a PNG, which the report may use too.
     fn frames(&self, dir: &Path, index: usize, result: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, WriteError> {
         let pngs = frames::pngs(result).map_err(|e| WriteError::new(dir, e))?;
@@ -145,7 +208,11 @@ impl Studio<'_> {
             },
         };
         let pictures = Pictures::of(&images, frames, self.report_bytes).map_err(|e| WriteError::new(path, e))?;
-        let json = serde_json::to_vec(&pictures).map_err(|e| WriteError::new(path, e))?;
-        fs::write(path, json).map_err(|e| WriteError::new(path, e))
+        save(path, &pictures)
     }
+}
+
+fn save(path: &Path, pictures: &Pictures) -> Result<(), WriteError> {
+    let json = serde_json::to_vec(pictures).map_err(|e| WriteError::new(path, e))?;
+    fs::write(path, json).map_err(|e| WriteError::new(path, e))
 }

@@ -64,7 +64,7 @@ pub struct Record {
 }
 
 /// How one measurement went.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct MeasurementRecord {
     /// Index of the measurement in its file.
     pub index: usize,
@@ -76,6 +76,9 @@ pub struct MeasurementRecord {
     pub ssim_gaussian: Option<f64>,
     /// Mean PSNR of the RGB frames in dB; `None` for gray scenes.
     pub psnr_rgb_db: Option<f64>,
+    /// In how many bands of rows it was solved, if in several: their trace is that of the band in the middle, and seconds are the sum.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bands: Option<usize>,
     /// Wall-clock seconds of the solve with its warm start, without reading, writing and metrics.
     pub seconds: f64,
     /// Iterations done.
@@ -140,10 +143,11 @@ pub struct Adaptation {
 }
 
 /// Why a solve ended; the same reasons as [`admm::StopReason`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Stop {
     /// Every stage was run.
+    #[default]
     ScheduleDone,
     /// The relative change fell to the tolerance.
     Converged,

@@ -27,12 +27,11 @@ pub trait Show {
     fn stopped(&self) -> bool;
 }
 
-/// The measurements of a scene that an experiment wants.
+/// The measurements of a scene of `count` that an experiment wants.
 ///
 /// # Errors
 /// The first one that the scene does not have, and which it has.
-pub fn choose(experiment: &Experiment, scene: &Scene) -> Result<Vec<usize>, String> {
-    let count = scene.len();
+pub fn choose(experiment: &Experiment, count: usize) -> Result<Vec<usize>, String> {
     let chosen = experiment.data.measurements.clone().unwrap_or_else(|| (0..count).collect());
     match chosen.iter().find(|&&k| k >= count) {
         None => Ok(chosen),
@@ -78,10 +77,34 @@ pub fn measurement(
     let truth = scene.truth_of(k);
     let mut watch = Watch { truth, trace: Trace::default(), show };
     let solved = factory.solve(scene, left, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
-    let mut record = measurement_record(k, &solved, truth, watch.trace, planned);
+    let mut record = measurement_record(k, &solved, watch.trace, planned);
     let estimate = solved.outcome.estimate;
+    if let Some(truth) = truth {
+        record.compare(truth, estimate.sensor.view());
+    }
     record.psnr_rgb_db = estimate.rgb.as_ref().zip(scene.rgb_of(k)).map(|(x, t)| psnr_rgb(t, x.view()));
     Ok((record, estimate))
+}
+
+/// Solves a band of measurement `k`, the only measurement of `scene`; networks learn from it only if they are to. The record lacks what
+/// compares with a truth.
+///
+/// # Errors
+/// Those of [`Factory::solve`], with the measurement's number.
+pub fn band(
+    factory: &mut Factory<'_>,
+    scene: &Scene,
+    k: usize,
+    learns: bool,
+    show: &mut dyn Show,
+) -> anyhow::Result<(MeasurementRecord, Estimate)> {
+    let planned = factory.plan().iterations();
+    let mut watch = Watch { truth: scene.truth_of(0), trace: Trace::default(), show };
+    let solved =
+        if learns { factory.solve(scene, &[0], None, &mut watch) } else { factory.solve_as_learned(scene, &mut watch) };
+    let solved = solved.with_context(|| format!("measurement {k}"))?;
+    let record = measurement_record(k, &solved, watch.trace, planned);
+    Ok((record, solved.outcome.estimate))
 }
 
 /// The record of a run that began at `begin`, of these measurements and files.
@@ -126,16 +149,18 @@ pub fn advice(m: &MeasurementRecord, experiment: &Experiment) -> String {
     format!("measurement {} diverged in iteration {}: {suggestion}", m.index, m.iterations.saturating_sub(1))
 }
 
+impl MeasurementRecord {
+    /// Takes in how near the result `[T, H, W]` is to the truth.
+    pub(crate) fn compare(&mut self, truth: ArrayView3<'_, f32>, x: ArrayView3<'_, f32>) {
+        self.psnr_db = Some(mean_over_frames(truth, x, psnr));
+        self.ssim = Some(mean_over_frames(truth, x, ssim));
+        self.ssim_gaussian = Some(mean_over_frames(truth, x, ssim_gaussian));
+    }
+}
+
 /// How measurement `index` went; `whole` are the iterations of the schedule.
-fn measurement_record(
-    index: usize,
-    solved: &Solved,
-    truth: Option<ArrayView3<'_, f32>>,
-    trace: Trace,
-    whole: usize,
-) -> MeasurementRecord {
+fn measurement_record(index: usize, solved: &Solved, trace: Trace, whole: usize) -> MeasurementRecord {
     let Solved { outcome, planned, work, adaptation } = solved;
-    let x = outcome.estimate.sensor.view();
     // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
     // does not.
     let left = match outcome.stop {
@@ -145,10 +170,11 @@ fn measurement_record(
     let counts = adaptation.as_ref().map(|a| a.counts).unwrap_or_default();
     MeasurementRecord {
         index,
-        psnr_db: truth.map(|t| mean_over_frames(t, x, psnr)),
-        ssim: truth.map(|t| mean_over_frames(t, x, ssim)),
-        ssim_gaussian: truth.map(|t| mean_over_frames(t, x, ssim_gaussian)),
+        psnr_db: None,
+        ssim: None,
+        ssim_gaussian: None,
         psnr_rgb_db: None,
+        bands: None,
         seconds: outcome.seconds,
         iterations: outcome.iterations,
         stop: outcome.stop.into(),
@@ -169,7 +195,7 @@ fn measurement_record(
 }
 
 /// Mean over the frames of the PSNR over all three colors, `[T, 3, H, W]`.
-fn psnr_rgb(truth: ArrayView4<'_, f32>, video: ArrayView4<'_, f32>) -> f64 {
+pub(crate) fn psnr_rgb(truth: ArrayView4<'_, f32>, video: ArrayView4<'_, f32>) -> f64 {
     let (t, c, h, w) = truth.dim();
     // The colors of a frame one below the other are one image of three times the height.
     let stacked = (t, c * h, w);

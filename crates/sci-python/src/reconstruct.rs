@@ -106,7 +106,7 @@ fn solve(
     stop: &Stop,
     begin: Instant,
 ) -> anyhow::Result<Solved> {
-    let chosen = solve::choose(experiment, &scene).map_err(Refused)?;
+    let chosen = solve::choose(experiment, scene.len()).map_err(Refused)?;
     let mut look =
         |_, _| if stop.is_set() { std::ops::ControlFlow::Break(()) } else { std::ops::ControlFlow::Continue(()) };
     let calibration: Option<Calibration> = solve::calibrate(experiment, &mut scene, &chosen, &mut look)?;

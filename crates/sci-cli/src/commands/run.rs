@@ -1,7 +1,9 @@
 //! `sci run`: an experiment from its file to a folder of results.
 
+mod banded;
 mod results;
 mod solving;
+mod subject;
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -21,6 +23,7 @@ use crate::record::host;
 use crate::run_folder::{Finished, RunFolder, RunPlan, Wish, refuse_inputs};
 use crate::simulate::simulate;
 use crate::solve;
+use subject::Subject;
 
 /// Arguments of `sci run`.
 #[derive(Debug, clap::Args)]
@@ -51,19 +54,23 @@ impl Args {
         check_folder(&out)?;
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
-        let (mut scene, chosen) = scene_and_choice(&experiment)?;
-        let found = shown_on_a_bar(|watch| solve::calibrate(&experiment, &mut scene, &chosen, watch));
-        let calibration = match found {
-            Err(_) if interrupted() => return Ok(Done::Interrupted),
-            calibration => calibration?,
+        let (mut subject, chosen) = Subject::open(&experiment)?;
+        let calibration = match &mut subject {
+            Subject::Cut(_) => None,
+            Subject::Whole(scene) => {
+                match shown_on_a_bar(|watch| solve::calibrate(&experiment, scene, &chosen, watch)) {
+                    Err(_) if interrupted() => return Ok(Done::Interrupted),
+                    calibration => calibration?,
+                }
+            }
         };
         calibration.iter().flat_map(Calibration::lines).for_each(|line| outln!("{line}"));
-        let mut factory = Factory::new(&experiment, scene.cfa)?;
-        let shape = result_shape(&scene);
+        let mut factory = Factory::new(&experiment, subject.cfa())?;
+        let shape = subject.result_shape();
         let all = [chosen.len() * shape[0], shape[1], shape[2], shape[3]];
         experiment.output.format.holds(all).map_err(|e| UsageError(format!("output.format: {e}")))?;
         let plan = RunPlan {
-            identity: identity(&experiment, &scene, &factory, &chosen)?,
+            identity: identity(&experiment, &subject, &factory, &chosen)?,
             files: results::files(&experiment, &factory, shape[0], &chosen),
             measurements: chosen.clone(),
         };
@@ -72,12 +79,13 @@ impl Args {
             outln!("nothing is unfinished: {} holds the results of this run", out.display());
             return Ok(Done::Complete);
         };
-        self.announce(&experiment, &scene, chosen.len(), &folder, &out);
-        let solved = solve(&experiment, &scene, &chosen, &mut factory, &mut folder);
+        self.announce(&experiment, &subject, chosen.len(), &folder, &out);
+        let solved = solve(&experiment, &subject, &chosen, &mut factory, &mut folder);
         let stopped = folder.finished().iter().filter(|f| f.is_whole()).count();
         let run = results::Results {
             experiment: &experiment,
-            scene: &scene,
+            shape,
+            unit: subject.unit(),
             factory: &factory,
             out: &out,
             begin,
@@ -102,15 +110,16 @@ impl Args {
         }
     }
 
-    fn announce(&self, experiment: &Experiment, scene: &Scene, count: usize, folder: &RunFolder, out: &Path) {
+    fn announce(&self, experiment: &Experiment, subject: &Subject, count: usize, folder: &RunFolder, out: &Path) {
         let plural = if count == 1 { "" } else { "s" };
         outln!(
-            "{} on {}: {} + {}, {count} measurement{plural} of {}",
+            "{} on {}: {} + {}, {count} measurement{plural} of {}{}",
             experiment.name,
             experiment.scene_name(),
             experiment.solver.kind,
             experiment.denoiser_kinds(),
-            scene.operator.shape()
+            subject.shape(),
+            subject.in_bands()
         );
         match folder.finished().len() {
             0 if self.resume => outln!("nothing is unfinished in {}: beginning", out.display()),
@@ -123,11 +132,15 @@ impl Args {
 /// Solves what is left, with the pictures made meanwhile.
 fn solve(
     experiment: &Experiment,
-    scene: &Scene,
+    subject: &Subject,
     chosen: &[usize],
     factory: &mut Factory<'_>,
     folder: &mut RunFolder,
 ) -> anyhow::Result<()> {
+    let scene = match subject {
+        Subject::Whole(scene) => scene,
+        Subject::Cut(cut) => return cut.solve_all(experiment, chosen, factory, folder),
+    };
     let limit = experiment.output.report_megabytes as usize * 1_000_000;
     let studio = Studio { scene, output: experiment.output, report_bytes: limit / chosen.len().max(1) };
     let before: Vec<Finished> = folder.finished().to_vec();
@@ -137,32 +150,24 @@ fn solve(
 /// Everything that the bits of a run depend on.
 fn identity(
     experiment: &Experiment,
-    scene: &Scene,
+    subject: &Subject,
     factory: &Factory<'_>,
     chosen: &[usize],
 ) -> anyhow::Result<serde_json::Value> {
-    let mut sum = crc32fast::Hasher::new();
-    scene.measurements.iter().for_each(|y| sum.update(&y.to_le_bytes()));
     Ok(json!({
         "version": host::VERSION,
         "kernel": factory.kernel()?,
         "measurements": chosen,
-        "checksum of the data": format!("{:08x}", sum.finalize()),
+        "checksum of the data": format!("{:08x}", subject.checksum(chosen)?),
         "config": experiment.to_json(),
     }))
-}
-
-/// `[T, C, H, W]` of the result of a measurement.
-fn result_shape(scene: &Scene) -> [usize; 4] {
-    let VideoShape { frames, height, width } = scene.operator.shape();
-    [frames, if scene.cfa.is_some() { 3 } else { 1 }, height, width]
 }
 
 /// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted.
 pub(super) fn scene_and_choice(experiment: &Experiment) -> anyhow::Result<(Scene, Vec<usize>)> {
     let scene = read_scene(experiment).context("data.path")?;
     scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
-    let chosen = solve::choose(experiment, &scene).map_err(UsageError)?;
+    let chosen = solve::choose(experiment, scene.len()).map_err(UsageError)?;
     Ok((scene, chosen))
 }
 

@@ -93,6 +93,7 @@ impl Data {
                 shift: mask_shift(t, simulated),
                 raw: if t.holds("raw") { Some(t.part("raw", |t| Ok(raw(t)))?) } else { None },
                 sensor: t.part("sensor", |t| Ok(sensor(t)))?,
+                ..Reading::default()
             },
             simulate,
             calibration: calibration(t),

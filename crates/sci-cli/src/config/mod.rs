@@ -18,6 +18,7 @@ use nets::unrolled::Recipe;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use crate::bands::Footprint;
 use crate::parts::{Chosen, Demosaicer, first_of_all};
 use crate::shipped;
 use crate::solvers::{self, Solver, Start};
@@ -29,6 +30,11 @@ pub use online::Online;
 pub use output::Output;
 pub use skip::Skip;
 pub use stage::Stage;
+
+/// What reading a gray scene and solving it take without the denoiser, measured.
+const SOLVING_GRAY: Footprint = Footprint { of_frame_pixel: 24, of_pixel: 16 };
+/// The same of a color sensor, demosaicing included.
+const SOLVING_COLOR: Footprint = Footprint { of_frame_pixel: 48, of_pixel: 40 };
 
 /// An experiment ready to run.
 #[derive(Debug)]
@@ -55,6 +61,8 @@ pub struct Experiment {
     pub online: Option<Online>,
     /// The solve that they learn through, where they do so before it.
     pub recipe: Option<Recipe>,
+    /// The memory that a solve may take, in bytes, if it is limited.
+    pub memory: Option<usize>,
     /// What to write.
     pub output: Output,
     /// The keys of its tables, defaults filled in.
@@ -145,6 +153,7 @@ fn from_source(source: &Source, paths: Paths, arguments: &[String]) -> Result<Ex
 struct Tables<'s> {
     name: Option<String>,
     seed: u64,
+    memory: Option<usize>,
     data: Option<Table<'s>>,
     solver: Option<Table<'s>>,
     schedule: stage::Tables<'s>,
@@ -164,6 +173,7 @@ impl<'s> Tables<'s> {
         Ok(Self {
             name: t.text("name", legal, |n| n.split('/').all(part_ok)),
             seed: t.seed("seed", 0),
+            memory: t.legal("memory", MEMORY, |v| v.as_str().and_then(bytes)),
             data: t.table("data")?,
             solver: t.table("solver")?,
             schedule: stage::Tables::take(t)?,
@@ -175,11 +185,31 @@ impl<'s> Tables<'s> {
     }
 }
 
+/// Legal `memory`.
+const MEMORY: &str =
+    "a number with its unit from \"128 MB\" to \"64 TB\": MB, GB or TB, MiB, GiB or TiB, for example \"4 GiB\"";
+
+/// How many bytes a text such as `4 GiB` means.
+fn bytes(text: &str) -> Option<usize> {
+    let at = text.find(|c: char| c.is_ascii_alphabetic())?;
+    let unit = match text[at..].trim_end() {
+        "MB" => 1e6,
+        "GB" => 1e9,
+        "TB" => 1e12,
+        "MiB" => 1_048_576.0,
+        "GiB" => 1_073_741_824.0,
+        "TiB" => 1_099_511_627_776.0,
+        _ => return None,
+    };
+    let bytes = text[..at].trim().parse::<f64>().ok()? * unit;
+    (128e6..=64e12).contains(&bytes).then_some(bytes as usize)
+}
+
 fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experiment, ConfigError> {
     let (tables, _) = Table::root(source, paths)?.read(Tables::take)?;
     let missing = |key: &str| source.file_error(format!("no [{key}] table"));
     let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
-    let (name, seed) = (tables.name.unwrap_or_else(stem), tables.seed);
+    let (name, seed, memory) = (tables.name.unwrap_or_else(stem), tables.seed, tables.memory);
     let (data, data_json) = tables.data.ok_or_else(|| missing("data"))?.read(|t| Data::read(t, seed))?;
     let solver = solvers::read(tables.solver.ok_or_else(|| missing("solver"))?)?;
     let (mut skip, mut skip_json) = unless_off(tables.skip, |t| Skip::read(t, seed))?;
@@ -194,10 +224,13 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         .read(|t| Ok((t.number("relative_change", 0.0, 0.0..=1.0), t.optional_number("seconds", 1e-3..=1e6))))?;
     let (minimal, output) = tables.output;
     let (output, output_json) = output.read(|t| Ok(Output::read(t, minimal)))?;
-    let json = json!({
+    let mut json = json!({
         "name": name, "seed": seed, "data": data_json, "stop": stop_json, "skip": skip_json, "online": online_json,
         "output": output_json,
     });
+    if let Some(memory) = memory {
+        json["memory"] = memory.into();
+    }
     let written = Written::of(source, arguments);
     let mut experiment = Experiment {
         name,
@@ -211,6 +244,7 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         skip,
         online,
         recipe: None,
+        memory,
         output,
         json,
         written,
@@ -309,6 +343,36 @@ impl Experiment {
             self.stages.insert(0, Stage { sigma: None, iterations: 16, denoiser: self.denoisers.len() });
             self.denoisers.push(first_of_all());
         }
+    }
+
+    /// What reading and solving a scene take at most; of a color sensor's if `is_color`.
+    pub fn footprint(&self, is_color: bool) -> Footprint {
+        let solver = if is_color { SOLVING_COLOR } else { SOLVING_GRAY };
+        // A network that demosaics is as large as the largest denoiser.
+        let demosaicer = self.solver.demosaicer.as_ref().and_then(|d| d.weights());
+        let demosaicer = demosaicer.map(|_| Footprint { of_frame_pixel: 32, of_pixel: 1250 });
+        let parts = self.denoisers.iter().map(|d| d.part.footprint(is_color)).chain(demosaicer);
+        parts.fold(solver, |most, part| Footprint {
+            of_frame_pixel: most.of_frame_pixel.max(solver.of_frame_pixel + part.of_frame_pixel),
+            of_pixel: most.of_pixel.max(solver.of_pixel + part.of_pixel),
+        })
+    }
+
+    /// What needs the whole of a scene at once, if anything does: a key, and why.
+    pub fn needs_whole(&self) -> Option<(&'static str, &'static str)> {
+        let data = &self.data;
+        let reasons = [
+            (
+                "data.kind",
+                data.simulate.is_some(),
+                "a simulated scene is made as a whole; `sci simulate` writes it to a file",
+            ),
+            ("data.mask_shift", data.reading.shift.is_some(), "a moving mask is moved as a whole"),
+            ("data.raw", data.reading.raw.is_some(), "a file without a header is read as a whole"),
+            ("data.calibration", data.calibration != Calibration::None, "masks are calibrated as a whole"),
+            ("solver.start", self.solver.start == Start::Previous, "the result before is kept as a whole"),
+        ];
+        reasons.into_iter().find(|(_, holds, _)| *holds).map(|(key, _, why)| (key, why))
     }
 
     /// The file or folder name of the data, as the run record's `scene`.

@@ -262,6 +262,11 @@ pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
     small
 }
 
+/// [`halved_to`] of a video that is larger, else the video as it is.
+pub fn shrunk(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
+    if longer_side(video) > side { halved_to(video, side) } else { video.to_owned() }
+}
+
 /// The larger of height and width.
 pub fn longer_side(video: ArrayView4<'_, f32>) -> usize {
     video.len_of(Axis(2)).max(video.len_of(Axis(3)))

@@ -3,12 +3,16 @@
 //! Both store row-major arrays. MATLAB, column-major itself, stores a variable of size `[H, W, T]` as shape `[T, W, H]`; other
 //! programs store the shape that they mean. What MATLAB wrote says so, in a block before the HDF5 data and in attributes.
 
+use std::ops::Range;
+use std::path::Path;
+
 use hdf5_reader::error::{ByteOrder, Error};
 use hdf5_reader::filters::FilterRegistry;
 use hdf5_reader::group::Group;
 use hdf5_reader::messages::datatype::{CompoundField, Datatype, ReferenceType};
-use hdf5_reader::{Dataset, Hdf5File, OpenOptions};
+use hdf5_reader::{Dataset, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 
+use super::npy::Header;
 use super::samples::{Array, Budget, Endian, SampleType, Samples, element_count};
 use super::{NamedArrays, ReadError};
 
@@ -44,17 +48,7 @@ fn bad(reason: impl std::fmt::Display) -> ReadError {
 /// [`ReadError`] for damaged bytes, or a wanted array that is not of real numbers or would not fit the budget.
 pub fn read(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError> {
     let mut budget = Budget::for_file(bytes.len());
-    let limit = budget.left();
-    let mut filters = FilterRegistry::new();
-    filters.register(LZF, Box::new(move |filter, data, _| unpack_lzf(&filter.client_data, data, limit)));
-    let options = OpenOptions::default()
-        .with_max_read_bytes(limit)
-        .with_max_chunk_bytes(limit)
-        // Every dataset is read once, so nothing is worth keeping.
-        .with_chunk_cache_bytes(0)
-        .with_filter_registry(filters)
-        .with_max_object_header_bytes(1 << 20);
-    let file = Hdf5File::from_bytes_with_options(bytes, options).map_err(bad)?;
+    let file = Hdf5File::from_bytes_with_options(bytes, options(budget.left())).map_err(bad)?;
     let root = file.root_group().map_err(bad)?;
     let mut found = NamedArrays::default();
     list(&root, "", MAX_DEPTH, &mut found.names)?;
@@ -69,6 +63,80 @@ pub fn read(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError> {
         found.arrays.insert(name.to_owned(), array);
     }
     Ok(found)
+}
+
+/// How files are opened, so that nothing in one takes more than `limit` bytes.
+fn options(limit: usize) -> OpenOptions {
+    let mut filters = FilterRegistry::new();
+    filters.register(LZF, Box::new(move |filter, data, _| unpack_lzf(&filter.client_data, data, limit)));
+    OpenOptions::default()
+        .with_max_read_bytes(limit)
+        .with_max_chunk_bytes(limit)
+        // Every dataset is read once, so nothing is worth keeping.
+        .with_chunk_cache_bytes(0)
+        .with_filter_registry(filters)
+        .with_max_object_header_bytes(1 << 20)
+}
+
+/// A file on disk, and the limit of what may be read of it at once.
+fn open_file(path: &Path) -> Result<Hdf5File, ReadError> {
+    let length = std::fs::metadata(path).map_err(ReadError::Io)?.len();
+    let limit = Budget::for_file(usize::try_from(length).unwrap_or(usize::MAX)).left();
+    Hdf5File::open_with_options(path, options(limit)).map_err(bad)
+}
+
+/// The arrays of plain real numbers in a file, with their shapes and types, and whether MATLAB wrote them.
+///
+/// # Errors
+/// [`ReadError`] for damaged bytes.
+pub(super) fn headers(path: &Path) -> Result<(Vec<(String, Header)>, bool), ReadError> {
+    let file = open_file(path)?;
+    let root = file.root_group().map_err(bad)?;
+    let mut names = Vec::new();
+    list(&root, "", MAX_DEPTH, &mut names)?;
+    let (mut found, mut of_matlab) = (Vec::new(), false);
+    for name in names {
+        let data = open(&root, &name)?;
+        of_matlab |= data.attribute("MATLAB_class").is_ok();
+        let Some((kind, _, 1)) = numbers(data.dtype()) else { continue };
+        let shape: Option<Vec<usize>> = data.shape().iter().map(|&d| usize::try_from(d).ok()).collect();
+        if let Some(shape) = shape.filter(|shape| element_count(shape).is_some()) {
+            found.push((name, Header::plain(shape, kind)));
+        }
+    }
+    Ok((found, of_matlab))
+}
+
+/// The part of an array from [`headers`] within a range of each axis.
+///
+/// # Errors
+/// [`ReadError`] for damaged bytes.
+pub(super) fn read_part(path: &Path, name: &str, ranges: &[Range<usize>]) -> Result<Array, ReadError> {
+    let file = open_file(path)?;
+    let data = open(&file.root_group().map_err(bad)?, name)?;
+    let slice = |r: &Range<usize>| SliceInfoElem::Slice { start: r.start as u64, end: r.end as u64, step: 1 };
+    let part = SliceInfo { selections: ranges.iter().map(slice).collect() };
+    let shape = ranges.iter().map(ExactSizeIterator::len).collect();
+    let (kind, ..) = numbers(data.dtype()).ok_or(ReadError::NotNumeric { key: name.into(), what: "not numbers" })?;
+    macro_rules! floats {
+        ($t:ty) => {
+            Samples::Floats(data.read_slice::<$t>(&part).map_err(bad)?.iter().map(|&v| v as f32).collect())
+        };
+    }
+    let samples = match kind {
+        SampleType::U8 => Samples::Bytes(data.read_slice::<u8>(&part).map_err(bad)?.into_iter().collect()),
+        SampleType::I8 => floats!(i8),
+        SampleType::I16 => floats!(i16),
+        SampleType::U16 => floats!(u16),
+        SampleType::I32 => floats!(i32),
+        SampleType::U32 => floats!(u32),
+        SampleType::I64 => floats!(i64),
+        SampleType::U64 => floats!(u64),
+        SampleType::F32 => floats!(f32),
+        SampleType::F64 => floats!(f64),
+        SampleType::F16 => return Err(bad(format!("`{name}`: parts of arrays of 16-bit floats cannot be read"))),
+    };
+    Array::new(shape, samples, kind)
 }
 
 /// The names of all datasets, a group's after those beside it.

@@ -15,6 +15,7 @@ pub mod raw;
 pub mod recon;
 pub mod samples;
 pub mod scene;
+pub mod slab;
 pub mod tiff;
 pub mod video;
 

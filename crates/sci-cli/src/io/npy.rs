@@ -40,48 +40,84 @@ fn bad(reason: impl Into<String>) -> ReadError {
 /// shape needs.
 pub fn read_npy(bytes: &[u8]) -> Result<Array, ReadError> {
     let layout = layout(bytes)?;
-    let raw = bytes[layout.data.clone()].to_vec();
-    layout.decode(raw, &mut Budget::for_file(bytes.len()))
+    let raw = bytes[layout.data].to_vec();
+    layout.header.decode(layout.header.shape.clone(), raw, &mut Budget::for_file(bytes.len()))
 }
 
-/// What a header says of an array, and where its data lie.
-struct Layout {
-    shape: Vec<usize>,
-    stored: SampleType,
+/// What a header says of an array.
+#[derive(Clone, Debug)]
+pub(super) struct Header {
+    pub(super) shape: Vec<usize>,
+    pub(super) stored: SampleType,
     endian: Endian,
     /// Numbers of a sample: 2 of a complex one.
     parts: usize,
-    fortran: bool,
+    pub(super) fortran: bool,
+}
+
+/// A header, and where its data lie.
+struct Layout {
+    header: Header,
     data: Range<usize>,
 }
 
 fn layout(bytes: &[u8]) -> Result<Layout, ReadError> {
-    let (header, data) = split_header(bytes)?;
-    let (stored, endian, parts) = sample_type(quoted(header, "descr")?)?;
-    let fortran = match after(header, "fortran_order")? {
+    let (text, data) = split_header(bytes)?;
+    let header = header_of(text)?;
+    let needed = usize::try_from(header.bytes()).ok().filter(|&n| n <= data.len());
+    let Some(needed) = needed else { return Err(header.cut_short(data.len() as u64)) };
+    let start = bytes.len() - data.len();
+    Ok(Layout { header, data: start..start + needed })
+}
+
+fn header_of(text: &str) -> Result<Header, ReadError> {
+    let (stored, endian, parts) = sample_type(quoted(text, "descr")?)?;
+    let fortran = match after(text, "fortran_order")? {
         s if s.starts_with("True") => true,
         s if s.starts_with("False") => false,
         _ => return Err(bad("`fortran_order` is neither True nor False")),
     };
-    let shape = shape(header)?;
-    let count = element_count(&shape).ok_or_else(|| bad(format!("shape {shape:?} overflows")))?;
-    let needed = count.checked_mul(parts * stored.size()).filter(|&n| n <= data.len());
-    let Some(needed) = needed else {
-        return Err(bad(format!(
-            "cut short: shape {shape:?} of {}-byte samples, but {} bytes of data",
-            parts * stored.size(),
-            data.len()
-        )));
-    };
-    let start = bytes.len() - data.len();
-    Ok(Layout { shape, stored, endian, parts, fortran, data: start..start + needed })
+    let shape = shape(text)?;
+    let bytes = element_count(&shape).and_then(|n| n.checked_mul(parts * stored.size()));
+    bytes.ok_or_else(|| bad(format!("shape {shape:?} overflows")))?;
+    Ok(Header { shape, stored, endian, parts, fortran })
 }
 
-impl Layout {
-    /// The array, of the bytes in [`Layout::data`]. What it needs beside them is claimed.
-    fn decode(self, raw: Vec<u8>, budget: &mut Budget) -> Result<Array, ReadError> {
-        let Self { shape, stored, endian, parts, fortran, .. } = self;
-        let count = raw.len() / (parts * stored.size());
+/// The header at the beginning of a file, and how many bytes it takes.
+pub(super) fn read_header(file: &mut impl Read) -> Result<(Header, u64), ReadError> {
+    let mut bytes = vec![0; 12];
+    file.read_exact(&mut bytes).map_err(ReadError::Io)?;
+    let missing = header_length(&bytes)?.end - bytes.len();
+    file.take(missing as u64).read_to_end(&mut bytes).map_err(ReadError::Io)?;
+    let (text, _) = split_header(&bytes)?;
+    Ok((header_of(text)?, bytes.len() as u64))
+}
+
+impl Header {
+    /// Of real numbers in row-major order that another format decodes.
+    pub(super) fn plain(shape: Vec<usize>, stored: SampleType) -> Self {
+        Self { shape, stored, endian: Endian::Little, parts: 1, fortran: false }
+    }
+
+    /// Bytes of a sample in the file.
+    pub(super) fn sample(&self) -> usize {
+        self.parts * self.stored.size()
+    }
+
+    /// Bytes of all samples.
+    pub(super) fn bytes(&self) -> u64 {
+        (self.shape.iter().product::<usize>() * self.sample()) as u64
+    }
+
+    pub(super) fn cut_short(&self, found: u64) -> ReadError {
+        let Self { shape, .. } = self;
+        bad(format!("cut short: shape {shape:?} of {}-byte samples, but {found} bytes of data", self.sample()))
+    }
+
+    /// An array of this `shape`, of its bytes. What it needs beside them is claimed.
+    pub(super) fn decode(&self, shape: Vec<usize>, raw: Vec<u8>, budget: &mut Budget) -> Result<Array, ReadError> {
+        let Self { stored, endian, parts, fortran, .. } = *self;
+        let count = raw.len() / self.sample();
         // Complex numbers are there in whole before their real parts are taken out.
         budget.claim(count, (2 * parts - 1) * stored.decoded_size())?;
         let samples = Samples::decode(raw, stored, endian);
@@ -95,6 +131,14 @@ impl Layout {
 }
 
 fn split_header(bytes: &[u8]) -> Result<(&str, &[u8]), ReadError> {
+    let range = header_length(bytes)?;
+    let header = bytes.get(range.clone()).ok_or_else(|| bad("cut short inside its header"))?;
+    let header = std::str::from_utf8(header).map_err(|_| bad("header is not text"))?;
+    Ok((header, &bytes[range.end..]))
+}
+
+/// Where the text of a header is, by its first 12 bytes.
+fn header_length(bytes: &[u8]) -> Result<Range<usize>, ReadError> {
     let short = || bad("cut short inside its header");
     if !is_npy(bytes) {
         return Err(bad("does not begin with the NumPy magic bytes"));
@@ -112,9 +156,7 @@ fn split_header(bytes: &[u8]) -> Result<(&str, &[u8]), ReadError> {
     if len > MAX_HEADER {
         return Err(bad(format!("header of {len} bytes, at most {MAX_HEADER} are accepted")));
     }
-    let header = bytes.get(start..start + len).ok_or_else(short)?;
-    let header = std::str::from_utf8(header).map_err(|_| bad("header is not text"))?;
-    Ok((header, &bytes[start + len..]))
+    Ok(start..start + len)
 }
 
 /// What follows `'key':` in the header's dictionary.
@@ -227,7 +269,7 @@ fn read_member(member: zip::read::ZipFile<'_, impl Read>, budget: &mut Budget) -
     let layout = layout(&raw)?;
     raw.truncate(layout.data.end);
     raw.drain(..layout.data.start);
-    let array = layout.decode(raw, budget)?;
+    let array = layout.header.decode(layout.header.shape.clone(), raw, budget)?;
     budget.release(size);
     Ok(array)
 }

@@ -4,6 +4,7 @@ use anyhow::Context;
 use nets::Ends;
 
 use super::{Built, Entry, Inference, Part, Site};
+use crate::bands::Footprint;
 use crate::table::Table;
 
 pub(super) const ENTRY: Entry = Entry { kind: "fastdvdnet", read };
@@ -28,6 +29,11 @@ impl Part for Fastdvdnet {
 
     fn adapts(&self) -> bool {
         true
+    }
+
+    fn footprint(&self, is_color: bool) -> Footprint {
+        let (of_frame_pixel, of_pixel) = if is_color { (32, 1250) } else { (8, 1250) };
+        Footprint { of_frame_pixel, of_pixel }
     }
 
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

@@ -3,6 +3,7 @@
 use anyhow::Context;
 
 use super::{Built, Entry, Inference, Part, Site};
+use crate::bands::Footprint;
 use crate::table::Table;
 
 pub(super) const ENTRY: Entry = Entry { kind: "ffdnet", read };
@@ -21,6 +22,11 @@ impl Part for Ffdnet {
 
     fn adapts(&self) -> bool {
         true
+    }
+
+    fn footprint(&self, is_color: bool) -> Footprint {
+        let (of_frame_pixel, of_pixel) = if is_color { (8, 280) } else { (0, 200) };
+        Footprint { of_frame_pixel, of_pixel }
     }
 
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

@@ -20,6 +20,7 @@ use online::{AdaptConfig, SplitRecord, Task, Update};
 use sci_forward::{CfaPattern, Measurement};
 use serde_json::Value;
 
+use crate::bands::Footprint;
 use crate::table::{ConfigError, Table};
 
 pub use demosaicer::{Demosaicer, Sensor};
@@ -82,6 +83,11 @@ pub trait Part: Debug + Send + Sync {
     /// Why it must be given the video as a whole (`[skip]`), if it must.
     fn against_tiles(&self) -> Option<&'static str> {
         None
+    }
+
+    /// What it takes while it works, beside its input and output.
+    fn footprint(&self, _is_color: bool) -> Footprint {
+        Footprint::default()
     }
 
     /// What all measurements share of it, such as a loaded network.

@@ -3,6 +3,7 @@
 use admm::{Denoiser, PerLattice, Prior, Wavelet};
 
 use super::{Built, Entry, Part, Saving, Sensor, Site};
+use crate::bands::Footprint;
 use crate::table::Table;
 
 pub(super) const ENTRY: Entry = Entry { kind: "wavelet", read };
@@ -19,6 +20,10 @@ fn read(t: &mut Table<'_>) -> Box<dyn Part> {
 }
 
 impl Part for Threshold {
+    fn footprint(&self, _is_color: bool) -> Footprint {
+        Footprint { of_frame_pixel: 0, of_pixel: 180 }
+    }
+
     fn build(&self, _site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {
         Ok(Box::new(*self))
     }

@@ -3,6 +3,7 @@
 use admm::{Denoiser, PerLattice, Prior, Wnnm, WnnmParams};
 
 use super::{Built, Entry, Part, Saving, Sensor, Site, demosaicked};
+use crate::bands::Footprint;
 use crate::table::Table;
 
 pub(super) const ENTRY: Entry = Entry { kind: "wnnm", read };
@@ -32,6 +33,11 @@ impl Part for LowRank {
     fn against_tiles(&self) -> Option<&'static str> {
         let kept = self.params.match_every > 1;
         kept.then_some("denoiser.match_every is more than 1, and groups of one tile are not those of another")
+    }
+
+    /// Sums and weights of all patches, and the groups of one frame.
+    fn footprint(&self, _is_color: bool) -> Footprint {
+        Footprint { of_frame_pixel: 16, of_pixel: 400 }
     }
 
     fn build(&self, _site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

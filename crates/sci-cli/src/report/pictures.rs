@@ -88,6 +88,16 @@ impl Pictures {
     }
 }
 
+impl Pictures {
+    /// Pictures that are `factor` times smaller than what they are of, whose frames have these PSNRs.
+    #[must_use]
+    pub fn of_larger(self, factor: usize, psnr_db: &[Option<f64>]) -> Self {
+        let shown =
+            if self.psnr_db.is_empty() { Vec::new() } else { psnr_db.iter().step_by(self.step).copied().collect() };
+        Self { shrink: self.shrink * factor, psnr_db: shown, ..self }
+    }
+}
+
 /// How much smaller the frames have to be for all to fit, by the size of the first; not so small that nothing is seen.
 fn shrink(images: &MeasurementImages<'_>, full: Option<&[Vec<u8>]>, limit: usize) -> Result<usize, ImageError> {
     let (frames, side) = (images.recon.len_of(Axis(0)), longer_side(images.recon));
@@ -120,7 +130,7 @@ fn to_its_largest(y: ArrayView2<'_, f32>) -> Array4<f32> {
 }
 
 /// PSNR over all channels of a frame `[C, H, W]`; `None` (so that JSON has a form for it) where it is infinite.
-fn psnr(truth: ArrayView3<'_, f32>, frame: ArrayView3<'_, f32>) -> Option<f64> {
+pub(crate) fn psnr(truth: ArrayView3<'_, f32>, frame: ArrayView3<'_, f32>) -> Option<f64> {
     let sum = Zip::from(truth).and(frame).fold(0.0, |s, &a, &b| s + (f64::from(a) - f64::from(b)).powi(2));
     Some(-10.0 * (sum / truth.len() as f64).log10()).filter(|p| p.is_finite())
 }

@@ -9,6 +9,7 @@
 //! DIR/.sci-run/lock          held while a run works here
 //! DIR/.sci-run/run.json      which run this is
 //! DIR/.sci-run/m00/          a measurement: video.npy, its record, what the next one needs; later its pictures
+//! DIR/.sci-run/m01.bands/    those bands of a measurement that are solved, where it is solved in bands, each as a measurement is
 //! DIR/.sci-run/ours.json     files of DIR that are the run's while there is no record that lists them
 //! DIR/.sci-run/out/          the results before they are moved
 //! ```
@@ -18,8 +19,8 @@ mod store;
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{fmt, io};
 
 use serde_json::Value;
 
@@ -173,36 +174,48 @@ impl RunFolder {
             }
         } else {
             let stopped = self.solved_by_anyone();
-            if wish == Wish::New && stopped > 0 {
-                let plural = if stopped == 1 { "" } else { "s" };
+            if wish == Wish::New && stopped > Solved::default() {
                 return Err(Refusal(format!(
-                    "--out {}: a run was stopped there with {stopped} measurement{plural} solved; add --resume to go on with \
-                     it, or --restart to throw it away",
+                    "--out {}: a run was stopped there with {stopped} solved; add --resume to go on with it, or --restart to \
+                     throw it away",
                     self.dir.display()
                 ))
                 .into());
             }
             self.finished.clear();
+            self.clear_unfinished(false)?;
         }
-        self.clear_unfinished()?;
+        self.clear_unfinished(true)?;
         write_atomically(&path, |w| io::Write::write_all(w, format!("{:#}\n", plan.identity).as_bytes()))?;
         Ok(())
     }
 
-    /// How many measurements are there, of whichever run.
-    fn solved_by_anyone(&self) -> usize {
-        let entries = fs::read_dir(self.staging()).into_iter().flatten().flatten();
-        // Those with an extension were stopped, or are not whole.
-        entries.filter(|e| e.path().extension().is_none() && e.path().join(store::COMPLETE).exists()).count()
+    /// What is solved there, of whichever run.
+    fn solved_by_anyone(&self) -> Solved {
+        // Those with another extension were stopped, or are not whole.
+        let complete = |path: &PathBuf| path.extension().is_none() && path.join(store::COMPLETE).exists();
+        let (mut measurements, mut bands) = (0, 0);
+        for path in entries(&self.staging()) {
+            if path.extension().is_some_and(|e| e == store::BANDS) {
+                bands += entries(&path).filter(complete).count();
+            } else {
+                measurements += usize::from(complete(&path));
+            }
+        }
+        Solved { measurements, bands }
     }
 
-    /// Removes all but the finished measurements.
-    fn clear_unfinished(&self) -> Result<(), WriteError> {
+    /// Removes all but the finished measurements, and the bands of one that is not if they are to be kept.
+    fn clear_unfinished(&self, keep_bands: bool) -> Result<(), WriteError> {
         let staging = self.staging();
         for entry in fs::read_dir(&staging).map_err(fail(&staging))? {
             let path = entry.map_err(fail(&staging))?.path();
             let name = path.file_name().unwrap_or_default();
-            let kept = name == LOCK || name == OURS || name == RUN || self.finished.iter().any(|f| f.dir() == path);
+            let kept = name == LOCK
+                || name == OURS
+                || name == RUN
+                || self.finished.iter().any(|f| f.dir() == path)
+                || keep_bands && path.extension().is_some_and(|e| e == store::BANDS);
             if !kept {
                 remove(&path).map_err(fail(&path))?;
             }
@@ -261,7 +274,7 @@ impl RunFolder {
     /// The file system's.
     pub fn keep(mut self) -> Result<usize, WriteError> {
         self.finished.retain(Finished::is_whole);
-        self.clear_unfinished()?;
+        self.clear_unfinished(true)?;
         Ok(self.finished.len())
     }
 
@@ -292,7 +305,7 @@ impl Drop for RunFolder {
     /// A run that has solved nothing leaves nothing.
     fn drop(&mut self) {
         let staging = self.staging();
-        if staging.exists() && self.solved_by_anyone() == 0 && !staging.join(OURS).exists() {
+        if staging.exists() && self.solved_by_anyone() == Solved::default() && !staging.join(OURS).exists() {
             let _ = self.leave();
         }
         if self.created {
@@ -300,6 +313,34 @@ impl Drop for RunFolder {
             let _ = fs::remove_dir(&self.dir);
         }
     }
+}
+
+/// What is found in a folder, of whichever run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+struct Solved {
+    measurements: usize,
+    /// Of a measurement that is not solved as a whole.
+    bands: usize,
+}
+
+impl fmt::Display for Solved {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let plural = |n: usize| if n == 1 { "" } else { "s" };
+        let Self { measurements, bands } = *self;
+        if measurements > 0 || bands == 0 {
+            write!(f, "{measurements} measurement{}", plural(measurements))?;
+        }
+        if bands > 0 {
+            let and = if measurements > 0 { " and " } else { "" };
+            write!(f, "{and}{bands} band{} of a measurement", plural(bands))?;
+        }
+        Ok(())
+    }
+}
+
+/// What is in a folder, nothing of one that cannot be read.
+fn entries(dir: &Path) -> impl Iterator<Item = PathBuf> {
+    fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path())
 }
 
 /// Takes the lock of a folder, until the file is dropped.

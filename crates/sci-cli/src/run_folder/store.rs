@@ -19,6 +19,8 @@ use crate::record::MeasurementRecord;
 
 /// The file that makes a folder a measurement.
 pub(super) const COMPLETE: &str = "measurement.cbor";
+/// The extension of the folder of a measurement's bands.
+pub(super) const BANDS: &str = "bands";
 const VIDEO: &str = "video.npy";
 const SENSOR: &str = "sensor.npy";
 const WEIGHTS: &str = "weights";
@@ -148,15 +150,84 @@ impl RunFolder {
             checksums.push(write_array(&temporary.join(SENSOR), &estimate.sensor)?);
         }
         state(&temporary.join(WEIGHTS))?;
-        let path = temporary.join(COMPLETE);
-        let entry = Entry { record, checksums };
-        let mut bytes = Vec::new();
-        ciborium::into_writer(&entry, &mut bytes).map_err(|e| WriteError::new(&path, e.to_string()))?;
-        fs::write(&path, bytes).map_err(fail(&path))?;
-        fs::rename(&temporary, &dir).map_err(fail(&dir))?;
-        self.finished.push(Finished { dir, record: entry.record });
+        self.finished.push(completed(&temporary, &dir, Entry { record, checksums })?);
         Ok(())
     }
+
+    /// A band of a measurement, if it is solved and on disk.
+    pub fn band(&self, index: usize, band: usize) -> Option<Finished> {
+        Finished::read(&self.bands(index).join(format!("b{band:03}")), index)
+    }
+
+    /// Puts a solved band of a measurement on disk, `[T, C, rows, W]`; `sensor` is what the sensor sees of it, if a later measurement can
+    /// need that, and `state` writes the weights that it needs into a folder.
+    ///
+    /// # Errors
+    /// The file system's, and that of `state`.
+    pub fn store_band(
+        &self,
+        record: MeasurementRecord,
+        band: usize,
+        video: &Array4<f32>,
+        sensor: Option<&Array3<f32>>,
+        state: impl FnOnce(&Path) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        let dir = self.bands(record.index).join(format!("b{band:03}"));
+        let temporary = dir.with_extension("tmp");
+        remove(&temporary).map_err(fail(&temporary))?;
+        fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
+        let mut checksums = vec![write_array(&temporary.join(VIDEO), video)?];
+        if let Some(sensor) = sensor {
+            checksums.push(write_array(&temporary.join(SENSOR), sensor)?);
+        }
+        state(&temporary.join(WEIGHTS))?;
+        remove(&dir).map_err(fail(&dir))?;
+        completed(&temporary, &dir, Entry { record, checksums })?;
+        Ok(())
+    }
+
+    /// Makes a measurement of its bands, of which `learned` has what the next measurement needs: `write` puts the joined video into a file
+    /// and says how it went.
+    ///
+    /// # Errors
+    /// The file system's, and that of `write`.
+    pub fn join_bands(
+        &mut self,
+        index: usize,
+        learned: &Finished,
+        write: impl FnOnce(&Path) -> anyhow::Result<MeasurementRecord>,
+    ) -> anyhow::Result<()> {
+        let dir = self.measurement(index);
+        let temporary = dir.with_extension("tmp");
+        remove(&temporary).map_err(fail(&temporary))?;
+        fs::create_dir_all(&temporary).map_err(fail(&temporary))?;
+        let video = temporary.join(VIDEO);
+        let record = write(&video)?;
+        let mut checksums = vec![checksum(&video).map_err(fail(&video))?];
+        fs::rename(learned.weights(), temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
+        if learned.dir.join(SENSOR).exists() {
+            let sensor = temporary.join(SENSOR);
+            fs::rename(learned.dir.join(SENSOR), &sensor).map_err(fail(&sensor))?;
+            checksums.push(checksum(&sensor).map_err(fail(&sensor))?);
+        }
+        self.finished.push(completed(&temporary, &dir, Entry { record, checksums })?);
+        let bands = self.bands(index);
+        Ok(remove(&bands).map_err(fail(&bands))?)
+    }
+
+    fn bands(&self, index: usize) -> PathBuf {
+        self.measurement(index).with_extension(BANDS)
+    }
+}
+
+/// Makes a folder of arrays what it is to be, in one step.
+fn completed(temporary: &Path, dir: &Path, entry: Entry) -> Result<Finished, WriteError> {
+    let path = temporary.join(COMPLETE);
+    let mut bytes = Vec::new();
+    ciborium::into_writer(&entry, &mut bytes).map_err(|e| WriteError::new(&path, e.to_string()))?;
+    fs::write(&path, bytes).map_err(fail(&path))?;
+    fs::rename(temporary, dir).map_err(fail(dir))?;
+    Ok(Finished { dir: dir.to_owned(), record: entry.record })
 }
 
 /// Writes an array as `.npy`; its checksum.

@@ -5,13 +5,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::super::{Done, interrupted};
-use super::result_shape;
 use crate::calibration::Calibration;
 use crate::config::Experiment;
 use crate::factory::Factory;
 use crate::io::output::{WriteError, write_atomically};
 use crate::io::recon::{Parts, VideoFormat, join, link_or_copy};
-use crate::io::scene::Scene;
 use crate::io::video::join_gifs;
 use crate::pictures::{PIECE, PREVIEW, frame_name};
 use crate::record::{Record, Stop};
@@ -47,7 +45,10 @@ pub(super) fn files(
 /// A run of which no more is going to be solved.
 pub(super) struct Results<'r> {
     pub(super) experiment: &'r Experiment,
-    pub(super) scene: &'r Scene,
+    /// `[T, C, H, W]` of the result of a measurement.
+    pub(super) shape: [usize; 4],
+    /// What white is in units of the file's scale.
+    pub(super) unit: f32,
     pub(super) factory: &'r Factory<'r>,
     pub(super) out: &'r Path,
     /// When the command began.
@@ -95,9 +96,8 @@ impl Results<'_> {
     fn put_together(&self, folder: &RunFolder) -> anyhow::Result<Record> {
         let solved = folder.finished();
         let indices: Vec<usize> = solved.iter().map(|f| f.record.index).collect();
-        let shape = result_shape(self.scene);
-        let files = files(self.experiment, self.factory, shape[0], &indices);
-        self.put_videos(folder, shape)?;
+        let files = files(self.experiment, self.factory, self.shape[0], &indices);
+        self.put_videos(folder)?;
         for name in &files {
             if let Some(frame) = name.strip_prefix("frames/") {
                 let owner = solved.iter().find(|f| frame.starts_with(&frame_name_start(f)));
@@ -119,16 +119,16 @@ impl Results<'_> {
         Ok(record)
     }
 
-    fn put_videos(&self, folder: &RunFolder, shape: [usize; 4]) -> Result<(), WriteError> {
+    fn put_videos(&self, folder: &RunFolder) -> Result<(), WriteError> {
         let solved = folder.finished();
         let output = &self.experiment.output;
         let recon = folder.out(output.format.file_name())?;
         let paths: Vec<PathBuf> = solved.iter().map(Finished::video).collect();
         match paths.as_slice() {
             // What is on disk is the result already.
-            [only] if output.format == VideoFormat::Npy && self.scene.unit == 1.0 => link_or_copy(only, &recon)?,
+            [only] if output.format == VideoFormat::Npy && self.unit == 1.0 => link_or_copy(only, &recon)?,
             // Pictures show white as white; the numbers are on the measurements' own scale.
-            _ => join(&recon, output.format, &Parts { paths: &paths, shape, unit: self.scene.unit })?,
+            _ => join(&recon, output.format, &Parts { paths: &paths, shape: self.shape, unit: self.unit })?,
         }
         if output.preview {
             let parts: Vec<PathBuf> = solved.iter().map(|f| f.pictures().join(PREVIEW)).collect();

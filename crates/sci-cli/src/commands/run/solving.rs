@@ -64,7 +64,7 @@ fn pass_solved(scene: &Scene, factory: &mut Factory<'_>, folder: &RunFolder) -> 
     Ok(sensor)
 }
 
-fn line(m: &MeasurementRecord) -> String {
+pub(super) fn line(m: &MeasurementRecord) -> String {
     let quality = match (m.psnr_db, m.ssim) {
         (Some(p), Some(s)) => {
             let rgb = m.psnr_rgb_db.map_or(String::new(), |p| format!("   RGB {p:6.2} dB"));
@@ -91,11 +91,14 @@ fn line(m: &MeasurementRecord) -> String {
         .as_ref()
         .map_or(String::new(), |b| format!("   diverged in iteration {}, went on without {}", b.iteration, b.without));
     let (k, iterations, seconds) = (m.index, m.iterations, m.seconds);
-    format!("measurement {k:>2}   {quality}   {iterations} iterations   {seconds:.2} s{updates}{backed_off}{note}")
+    let bands = m.bands.map_or(String::new(), |n| format!(" in {n} bands"));
+    format!(
+        "measurement {k:>2}   {quality}   {iterations} iterations   {seconds:.2} s{bands}{updates}{backed_off}{note}"
+    )
 }
 
 /// Shows a solve on the terminal, until Ctrl-C.
-struct Bar(Progress);
+pub(super) struct Bar(pub(super) Progress);
 
 impl Show for Bar {
     fn begin(&mut self) {

@@ -25,6 +25,14 @@ pub enum SceneError {
         /// The names in the file.
         present: Vec<String>,
     },
+    /// A scene that has to be solved as a whole.
+    #[error("{file}: cannot be read in bands, which `memory` asks for: {why}")]
+    NotInBands {
+        /// The file.
+        file: String,
+        /// What stands against it, and what to do.
+        why: String,
+    },
     /// A color sensor too small to have every color.
     #[error("{file}: {height}×{width} pixels (rows × columns) are no color scene: a Bayer pattern needs at least 2×2")]
     NoBayerPattern {

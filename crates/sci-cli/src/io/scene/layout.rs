@@ -16,6 +16,15 @@ pub(super) struct Place<'a> {
     pub(super) axes: Option<Axes>,
 }
 
+/// Which axes of an array in its file are which.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct FileAxes {
+    /// None of a single frame.
+    pub(super) frame: Option<usize>,
+    pub(super) row: usize,
+    pub(super) column: usize,
+}
+
 impl Place<'_> {
     /// Pictures have the one order that their reader gives them.
     pub(super) fn is_picture(&self) -> bool {
@@ -25,6 +34,26 @@ impl Place<'_> {
     fn axes(&self) -> Axes {
         let usual = if self.format == Format::Mat { Axes::Hwt } else { Axes::Thw };
         if self.is_picture() { usual } else { self.axes.unwrap_or(usual) }
+    }
+
+    /// Which axes of an array in its file are which; nothing if its shape is not one of the plain ones.
+    pub(super) fn file_axes(&self, shape: &[usize]) -> Option<FileAxes> {
+        let reversed = self.format == Format::Mat;
+        let mut meant = shape.to_vec();
+        if reversed {
+            meant.reverse();
+        }
+        let (frame, row, column) = match (self.axes(), meant.as_slice()) {
+            (_, [_, _]) => (None, 0, 1),
+            (Axes::Thw, [_, _, _]) => (Some(0), 1, 2),
+            (Axes::Hwt, [_, _, _]) => (Some(2), 0, 1),
+            (Axes::Hwt, [_, _, 1 | 3, _]) => (Some(3), 0, 1),
+            (Axes::Thw, [_, 1 | 3, _, _]) => (Some(0), 2, 3),
+            (Axes::Thw, [_, _, _, 1 | 3]) => (Some(0), 1, 2),
+            _ => return None,
+        };
+        let in_file = |axis: usize| if reversed { shape.len() - 1 - axis } else { axis };
+        Some(FileAxes { frame: frame.map(in_file), row: in_file(row), column: in_file(column) })
     }
 
     fn wrong(&self, shape: &[usize], expected: &'static str) -> SceneError {

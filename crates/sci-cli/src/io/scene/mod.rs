@@ -13,6 +13,7 @@ use sci_forward::{
     BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator,
 };
 
+mod banded;
 #[cfg(test)]
 mod camera_tests;
 mod error;
@@ -24,8 +25,9 @@ mod sensor;
 mod shift;
 mod source;
 
+pub use banded::Banded;
 pub use error::SceneError;
-pub use read::{Arrays, Video, as_read, of_arrays, read, read_gray_video, read_mask, read_video};
+pub use read::{Arrays, Decided, Video, as_read, of_arrays, read, read_gray_video, read_mask, read_video};
 pub use sensor::{Clip, Sensor};
 pub use shift::MaskShift;
 
@@ -87,6 +89,8 @@ pub struct Reading {
     pub raw: Option<Raw>,
     /// What the sensor does to the light.
     pub sensor: Sensor,
+    /// Of a part of a scene, what its numbers mean.
+    pub decided: Option<Decided>,
 }
 
 /// Masks, measurements and truth that fit together.
@@ -111,6 +115,7 @@ pub struct Scene {
     pub clip: Option<f32>,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
+    decided: Decided,
 }
 
 impl std::fmt::Debug for Scene {
@@ -190,7 +195,8 @@ impl Scene {
             }
         };
         let (noise, clip) = (None, None);
-        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, noise, clip, warnings };
+        let decided = Decided::default();
+        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, noise, clip, warnings, decided };
         scene.look_for_wrong_scales(brightest);
         Ok(scene)
     }

@@ -16,14 +16,35 @@ use crate::io::samples::Array;
 use crate::io::{NamedArrays, defects};
 
 /// The arrays of a scene as they are stored.
-struct Parts {
-    keys: Keys,
-    names: Vec<String>,
-    mask: Option<Array>,
-    meas: Option<Array>,
-    orig: Option<Array>,
-    rgb: Option<Array>,
-    notes: Vec<String>,
+pub(super) struct Parts {
+    pub(super) keys: Keys,
+    pub(super) names: Vec<String>,
+    pub(super) mask: Option<Array>,
+    pub(super) meas: Option<Array>,
+    pub(super) orig: Option<Array>,
+    pub(super) rgb: Option<Array>,
+    pub(super) notes: Vec<String>,
+}
+
+/// What was decided of the numbers of a scene by their content; in a [`Reading`] of a part of a scene, what is to hold for it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Decided {
+    /// What open is in masks.
+    pub(super) open: f32,
+    /// What white is in the truth.
+    pub(super) truth: f32,
+    /// What white is in measurements.
+    pub(super) meas: f32,
+    /// Where measurements clip, in the unit of their file.
+    pub(super) clip: Option<f32>,
+    /// [`Scene::unit`].
+    pub(super) unit: f32,
+}
+
+impl Default for Decided {
+    fn default() -> Self {
+        Self { open: 1.0, truth: 1.0, meas: 1.0, clip: None, unit: 1.0 }
+    }
 }
 
 impl Parts {
@@ -91,10 +112,11 @@ pub fn of_arrays(arrays: Arrays, reading: &Reading) -> Result<Scene, SceneError>
     assembled(&Source::memory(), Parts { keys, names, mask: Some(mask), meas, orig, rgb, notes }, reading)
 }
 
-fn assembled(source: &Source, mut parts: Parts, reading: &Reading) -> Result<Scene, SceneError> {
+pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) -> Result<Scene, SceneError> {
     let mut notes = std::mem::take(&mut parts.notes);
-    let (mut mask, in_own_unit) = scene_masks(source, &mut parts, reading, &mut notes)?;
-    let mut truth = truth(source, &parts, reading, &mut notes)?;
+    let mut decided = reading.decided.unwrap_or_default();
+    let (mut mask, in_own_unit) = scene_masks(source, &mut parts, reading, &mut decided, &mut notes)?;
+    let mut truth = truth(source, &parts, reading, &mut decided, &mut notes)?;
     if parts.meas.is_none() && truth.is_none() {
         return Err(source.missing(
             &parts.keys.meas,
@@ -112,24 +134,32 @@ fn assembled(source: &Source, mut parts: Parts, reading: &Reading) -> Result<Sce
     } else if mask.len_of(Axis(0)) == 1 {
         notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
     }
-    let (mut unit, mut clip) = (1.0, None);
     if let (Some(meas), Some(array)) = (meas.as_mut(), &stored) {
-        let (level, note) = reading.sensor.clip.level(meas.view(), mask.sum_axis(Axis(0)).view());
-        notes.extend(note);
         let black = reading.sensor.black;
+        if reading.decided.is_none() {
+            let (level, note) = reading.sensor.clip.level(meas.view(), mask.sum_axis(Axis(0)).view());
+            notes.extend(note);
+            decided.clip = level;
+        }
         *meas -= black;
-        let white = white_of_measurements(&place, (array, meas.view()), &mask, truth.as_ref(), reading, &mut notes);
-        *meas /= white;
+        if reading.decided.is_none() {
+            let seen = (array, meas.view());
+            decided.meas = white_of_measurements(&place, seen, &mask, truth.as_ref(), reading, &mut notes);
+        }
+        *meas /= decided.meas;
         if meas.shape()[1..] == mask.shape()[1..] {
-            if reading.scale.is_none() {
-                unit = rescale((&mask, in_own_unit), meas, truth.as_mut(), &mut notes);
+            match reading.decided {
+                None if reading.scale.is_none() => {
+                    decided.unit = rescale((&mask, in_own_unit), meas, truth.as_mut(), &mut notes);
+                }
+                _ => *meas /= decided.unit,
             }
             look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
         }
-        clip = level.map(|level| (level - black) / (white * unit));
     }
     let mut scene = Scene::new(&source.file, &parts.keys, mask, meas, truth, reading.cfa)?;
-    (scene.unit, scene.clip, scene.noise) = (unit, clip, reading.sensor.noise);
+    let clip = decided.clip.map(|level| (level - reading.sensor.black) / (decided.meas * decided.unit));
+    (scene.unit, scene.clip, scene.noise, scene.decided) = (decided.unit, clip, reading.sensor.noise, decided);
     notes.append(&mut scene.warnings);
     scene.warnings = notes;
     Ok(scene)
@@ -161,10 +191,11 @@ fn scene_masks(
     source: &Source,
     parts: &mut Parts,
     reading: &Reading,
+    decided: &mut Decided,
     notes: &mut Vec<String>,
 ) -> Result<(Array3<f32>, bool), SceneError> {
     if let Some(path) = &reading.mask {
-        return masks_of(&Source::open(path, None)?, reading, notes);
+        return masks_of(&Source::open(path, None)?, reading, decided, notes);
     }
     let key = &parts.keys.mask;
     let Some(array) = parts.mask.take() else {
@@ -172,11 +203,16 @@ fn scene_masks(
         return Err(source.missing(key, "the masks; data.mask names a file of their own", names));
     };
     let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
-    Ok(normalised(place.frames(&array, 1.0)?, key, notes))
+    Ok(normalised(place.frames(&array, 1.0)?, key, reading.decided.is_some(), decided, notes))
 }
 
 /// The masks that a file holds, under their name if it has names.
-fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Result<(Array3<f32>, bool), SceneError> {
+fn masks_of(
+    source: &Source,
+    reading: &Reading,
+    decided: &mut Decided,
+    notes: &mut Vec<String>,
+) -> Result<(Array3<f32>, bool), SceneError> {
     let (array, key) = if source.is_named() {
         let own = Keys { mask: reading.keys.mask.clone(), ..Keys::default() };
         let found = names::resolved(&own, &source.names()?).mask;
@@ -203,7 +239,7 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
         }
         false => 1.0,
     };
-    let (masks, in_own_unit) = normalised(place.frames(&array, white)?, &key, notes);
+    let (masks, in_own_unit) = normalised(place.frames(&array, white)?, &key, false, decided, notes);
     let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
         file: source.file.clone(),
         key: key.clone(),
@@ -214,8 +250,15 @@ fn masks_of(source: &Source, reading: &Reading, notes: &mut Vec<String>) -> Resu
 
 /// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
 /// which the most open pixel is taken to be open. Small negative ones are what a dark frame leaves when it is taken off.
-fn normalised(mut mask: Array3<f32>, key: &str, notes: &mut Vec<String>) -> (Array3<f32>, bool) {
+fn normalised(
+    mut mask: Array3<f32>,
+    key: &str,
+    is_decided: bool,
+    decided: &mut Decided,
+    notes: &mut Vec<String>,
+) -> (Array3<f32>, bool) {
     let most = mask.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
+    let most = if is_decided { decided.open } else { most };
     let least = mask.iter().copied().fold(0.0, f32::min);
     if least < 0.0 && least >= -SMALL * most {
         let count = mask.iter().filter(|c| **c < 0.0).count();
@@ -229,6 +272,7 @@ fn normalised(mut mask: Array3<f32>, key: &str, notes: &mut Vec<String>) -> (Arr
     let is_black_and_white =
         scale::FULL_SCALES.iter().any(|&(_, full)| full == most) && mask.iter().all(|&v| v == 0.0 || v == most);
     mask /= most;
+    decided.open = most;
     (mask, !is_black_and_white)
 }
 
@@ -242,6 +286,7 @@ fn truth(
     source: &Source,
     parts: &Parts,
     reading: &Reading,
+    decided: &mut Decided,
     notes: &mut Vec<String>,
 ) -> Result<Option<Truth>, SceneError> {
     let (key, array) = match (&parts.rgb, &parts.orig) {
@@ -250,7 +295,10 @@ fn truth(
         (None, None) => return Ok(None),
     };
     let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
-    let white = white_of_video(&place, array, reading, notes);
+    if reading.decided.is_none() {
+        decided.truth = white_of_video(&place, array, reading, notes);
+    }
+    let white = decided.truth;
     if parts.rgb.is_none() {
         return Ok(Some(Truth::Sensor(place.frames(array, white)?)));
     }
@@ -453,7 +501,7 @@ fn luma(video: Array4<f32>) -> Array4<f32> {
 pub fn read_mask(path: &Path, reading: &Reading) -> Result<(MaskStack, Vec<String>), SceneError> {
     let source = Source::open(path, None)?;
     let mut notes = Vec::new();
-    let (masks, _) = masks_of(&source, reading, &mut notes)?;
+    let (masks, _) = masks_of(&source, reading, &mut Decided::default(), &mut notes)?;
     let masks = MaskStack::new(masks).map_err(|e| SceneError::Mask {
         file: source.file,
         key: reading.keys.mask.clone(),

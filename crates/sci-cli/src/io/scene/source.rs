@@ -25,8 +25,8 @@ enum Content {
     File(Vec<u8>, Format),
     /// A file of which is said what it holds.
     Raw(Vec<u8>, Raw),
-    /// Arrays in memory, which are handed on beside it.
-    Memory,
+    /// Arrays in memory, which are handed on beside it, laid out as in this format.
+    Memory(Format),
 }
 
 impl Source {
@@ -48,16 +48,20 @@ impl Source {
 
     /// Of a scene in memory.
     pub(super) fn memory() -> Self {
-        let file = "arrays".to_owned();
-        Self { path: PathBuf::from(&file), file, content: Content::Memory }
+        Self::part("arrays".to_owned(), Format::Npy)
+    }
+
+    /// Of the part of a file that is in memory.
+    pub(super) fn part(file: String, format: Format) -> Self {
+        Self { path: PathBuf::from(&file), file, content: Content::Memory(format) }
     }
 
     /// The format, of the arrays in a folder that of each.
     pub(super) fn format(&self) -> Format {
         match &self.content {
-            Content::Arrays(_) | Content::Memory => Format::Npy,
+            Content::Arrays(_) => Format::Npy,
             Content::Pictures => Format::Png,
-            Content::File(_, format) => *format,
+            Content::File(_, format) | Content::Memory(format) => *format,
             Content::Raw(..) => Format::Raw,
         }
     }
@@ -66,7 +70,7 @@ impl Source {
     pub(super) fn is_named(&self) -> bool {
         matches!(
             self.content,
-            Content::Arrays(_) | Content::Memory | Content::File(_, Format::Mat | Format::Hdf5 | Format::Npz)
+            Content::Arrays(_) | Content::Memory(_) | Content::File(_, Format::Mat | Format::Hdf5 | Format::Npz)
         )
     }
 
@@ -83,7 +87,7 @@ impl Source {
     pub(super) fn names(&self) -> Result<Vec<String>, SceneError> {
         match &self.content {
             Content::Arrays(names) => Ok(names.clone()),
-            Content::Memory => Ok(Vec::new()),
+            Content::Memory(_) => Ok(Vec::new()),
             _ if self.is_named() => Ok(self.arrays(&[])?.names),
             _ => Ok(Vec::new()),
         }
@@ -114,7 +118,7 @@ impl Source {
             Content::Pictures => Ok(frames::read(&self.path)?),
             Content::File(bytes, _) => Ok(read_single(bytes).map_err(|e| FileError::new(&self.path, e))?),
             Content::Raw(bytes, raw) => Ok(raw::read(bytes, *raw).map_err(|e| FileError::new(&self.path, e))?),
-            Content::Arrays(_) | Content::Memory => Err(FileError::new(&self.path, ReadError::NoFrames).into()),
+            Content::Arrays(_) | Content::Memory(_) => Err(FileError::new(&self.path, ReadError::NoFrames).into()),
         }
     }
 

@@ -1,0 +1,244 @@
+//! Owns a scene on disk that is read in bands of rows, a measurement at a time.
+
+use std::ops::Range;
+use std::path::Path;
+
+use ndarray::{Array2, Array3, Array4, Axis, concatenate};
+use sci_forward::bayer::mosaic_into;
+use sci_forward::{CfaPattern, VideoShape};
+
+use super::layout::{FileAxes, Place};
+use super::read::{Parts, assembled};
+use super::source::Source;
+use super::{Keys, Reading, Scene, SceneError, Truth, names};
+use crate::io::Format;
+use crate::io::samples::Array;
+use crate::io::slab::{self, Stored};
+
+/// A scene of which a band of rows is in memory at a time.
+///
+/// What white is, where measurements clip and what open is in masks is decided once, by the rows in the middle of the first measurement, and
+/// holds for all bands.
+#[derive(Clone, Debug)]
+pub struct Banded {
+    file: String,
+    reading: Reading,
+    mask: Part,
+    meas: Option<Part>,
+    truth: Option<Part>,
+    shape: VideoShape,
+    count: usize,
+    /// The pattern of a color sensor, `None` for a gray one.
+    pub cfa: Option<CfaPattern>,
+    /// As [`Scene::unit`].
+    pub unit: f32,
+    /// What looked odd but is no error.
+    pub warnings: Vec<String>,
+}
+
+/// An array that plays a part.
+#[derive(Clone, Debug)]
+struct Part {
+    key: String,
+    stored: Stored,
+    axes: FileAxes,
+    format: Format,
+}
+
+impl Part {
+    fn size(&self) -> (usize, usize) {
+        (self.stored.shape()[self.axes.row], self.stored.shape()[self.axes.column])
+    }
+
+    fn frames(&self) -> usize {
+        self.axes.frame.map_or(1, |axis| self.stored.shape()[axis])
+    }
+
+    /// Some rows of some frames.
+    fn read(&self, frames: Range<usize>, rows: Range<usize>) -> Result<Array, SceneError> {
+        let mut ranges: Vec<Range<usize>> = self.stored.shape().iter().map(|&length| 0..length).collect();
+        ranges[self.axes.row] = rows;
+        if let Some(axis) = self.axes.frame {
+            ranges[axis] = frames;
+        }
+        Ok(self.stored.read(&ranges)?)
+    }
+}
+
+impl Banded {
+    /// Looks at a scene, of which `rows` rows can be in memory at once.
+    ///
+    /// # Errors
+    /// [`SceneError`] naming the file and what is wrong with it: among others that it has to be read whole.
+    pub fn open(path: &Path, reading: &Reading, rows: usize) -> Result<Self, SceneError> {
+        let mut scene = Self::found(path, reading)?;
+        let (height, rows) = (scene.shape.height, rows.min(scene.shape.height).max(2));
+        let first = (height - rows) / 2 / 2 * 2;
+        let part = scene.band(0, first..first + rows)?;
+        if part.unit != 1.0 && scene.truth.is_some() {
+            let why = "neither measurements nor truth are on a usual scale; say in data.scale what white is".into();
+            return Err(SceneError::NotInBands { file: scene.file, why });
+        }
+        scene.reading.decided = Some(part.decided);
+        (scene.unit, scene.cfa) = (part.unit, part.cfa);
+        scene.warnings.extend(part.warnings);
+        Ok(scene)
+    }
+
+    /// The size of the frames of a scene that can be read in bands, and whether it is in color; nothing of one that cannot.
+    ///
+    /// # Errors
+    /// As [`Banded::open`].
+    pub fn outline(path: &Path, reading: &Reading) -> Result<(VideoShape, bool), SceneError> {
+        let scene = Self::found(path, reading)?;
+        Ok((scene.shape, scene.cfa.is_some()))
+    }
+
+    fn found(path: &Path, reading: &Reading) -> Result<Self, SceneError> {
+        let file = path.display().to_string();
+        let whole = |file: &Path| SceneError::NotInBands {
+            file: file.display().to_string(),
+            why: "of files, .npz, .npy, .h5 and .mat of version 7.3 can be; `sci simulate` and numpy write such".into(),
+        };
+        let slab::Arrays { named, format } = slab::arrays(path)?.ok_or_else(|| whole(path))?;
+        let listed: Vec<String> = named.iter().map(|(name, _)| name.clone()).collect();
+        let keys = names::resolved(&reading.keys, &listed);
+        let part_of = |named: &[(String, Stored)], key: &str, format: Format| {
+            let Some((_, stored)) = named.iter().find(|(name, _)| name == key) else { return Ok(None) };
+            let place = Place { file: &file, key, format, axes: reading.axes };
+            let why = || format!("`{key}` has shape {:?}, which is none of the plain ones", stored.shape());
+            let not_plain = || SceneError::NotInBands { file: file.clone(), why: why() };
+            let axes = place.file_axes(stored.shape()).ok_or_else(not_plain)?;
+            Ok::<_, SceneError>(Some(Part { key: key.to_owned(), stored: stored.clone(), axes, format }))
+        };
+        let mask = match &reading.mask {
+            None => part_of(&named, &keys.mask, format)?,
+            Some(path) => {
+                let own = slab::arrays(path)?.ok_or_else(|| whole(path))?;
+                let listed: Vec<String> = own.named.iter().map(|(name, _)| name.clone()).collect();
+                let found = names::resolved(&Keys { mask: reading.keys.mask.clone(), ..Keys::default() }, &listed);
+                let key = if own.named.len() == 1 { listed[0].clone() } else { found.mask };
+                part_of(&own.named, &key, own.format)?
+            }
+        };
+        let missing = |key: &str, part| {
+            let near = names::suggestion(key, &listed, &Keys::default());
+            SceneError::MissingKey { file: file.clone(), key: key.into(), part, near, present: listed.clone() }
+        };
+        let mask = mask.ok_or_else(|| missing(&keys.mask, "the masks; data.mask names a file of their own"))?;
+        let meas = part_of(&named, &keys.meas, format)?;
+        let rgb = part_of(&named, &keys.rgb, format)?;
+        let is_color = rgb.is_some() || reading.cfa.is_some();
+        let truth = if rgb.is_some() { rgb } else { part_of(&named, &keys.orig, format)? };
+        let frames = mask.frames();
+        let count = match (&meas, &truth) {
+            (Some(meas), _) => meas.frames(),
+            (None, Some(truth)) => truth.frames() / frames,
+            (None, None) => return Err(missing(&keys.meas, "measurements, or the truth to simulate them from")),
+        };
+        for part in [&meas, &truth].into_iter().flatten() {
+            if part.size() != mask.size() {
+                let (size, mask_size) = (part.size(), mask.size());
+                return Err(SceneError::SizeMismatch { file, key: part.key.clone(), size, mask: mask.key, mask_size });
+            }
+        }
+        if count == 0 {
+            let found = truth.map_or(0, |truth| truth.frames());
+            return Err(SceneError::TooFewFrames { file, frames: found, needed: frames });
+        }
+        let (height, width) = mask.size();
+        let warnings = names::notes(&reading.keys, &Keys { mask: reading.keys.mask.clone(), ..keys.clone() });
+        let reading = Reading { keys, mask: None, ..reading.clone() };
+        let cfa = is_color.then(|| reading.cfa.unwrap_or_default());
+        let shape = VideoShape { frames, height, width };
+        Ok(Self { file, reading, mask, meas, truth, shape, count, cfa, unit: 1.0, warnings })
+    }
+
+    /// B frames of the size of the sensor.
+    pub fn shape(&self) -> VideoShape {
+        self.shape
+    }
+
+    /// N, measurements.
+    pub fn len(&self) -> usize {
+        self.count
+    }
+
+    /// Whether there is no measurement.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// The frames of the truth that measurement `k` sums, if it reaches that far.
+    fn frames_of(&self, k: usize) -> Option<(&Part, Range<usize>)> {
+        let b = self.shape.frames;
+        let truth = self.truth.as_ref()?;
+        (truth.frames() >= (k + 1) * b).then_some((truth, k * b..(k + 1) * b))
+    }
+
+    /// The scene that these rows of measurement `k` are, its only one.
+    ///
+    /// # Errors
+    /// [`SceneError`] naming the file and what is wrong with it.
+    ///
+    /// # Panics
+    /// If there is no such measurement, or there are no such rows.
+    pub fn band(&self, k: usize, rows: Range<usize>) -> Result<Scene, SceneError> {
+        let source = Source::part(self.file.clone(), self.mask.format);
+        let mask = Some(self.mask.read(0..self.shape.frames, rows.clone())?);
+        let meas = self.meas.as_ref().map(|part| part.read(k..k + 1, rows.clone())).transpose()?;
+        let truth = self.frames_of(k).map(|(part, frames)| part.read(frames, rows)).transpose()?;
+        let (rgb, orig) = if self.has_rgb() { (truth, None) } else { (None, truth) };
+        let keys = self.reading.keys.clone();
+        assembled(&source, Parts { keys, names: Vec::new(), mask, meas, orig, rgb, notes: Vec::new() }, &self.reading)
+    }
+
+    fn has_rgb(&self) -> bool {
+        self.truth.as_ref().is_some_and(|truth| truth.key == self.reading.keys.rgb)
+    }
+
+    /// Frame `t` of the truth of measurement `k`, if it reaches that far.
+    ///
+    /// # Errors
+    /// As [`Banded::band`].
+    pub fn truth_frame(&self, k: usize, t: usize) -> Result<Option<Truth>, SceneError> {
+        let Some((part, frames)) = self.frames_of(k) else { return Ok(None) };
+        let array = part.read(frames.start + t..frames.start + t + 1, 0..self.shape.height)?;
+        let place = Place { file: &self.file, key: &part.key, format: part.format, axes: self.reading.axes };
+        let white = self.reading.decided.unwrap_or_default().truth;
+        Ok(Some(if self.has_rgb() {
+            Truth::Rgb(place.channels(&array, white)?)
+        } else {
+            Truth::Sensor(place.frames(&array, white)?)
+        }))
+    }
+
+    /// y `[H, W]` of measurement `k`.
+    ///
+    /// # Errors
+    /// As [`Banded::band`].
+    pub fn y(&self, k: usize) -> Result<Array2<f32>, SceneError> {
+        const ROWS: usize = 64;
+        let height = self.shape.height;
+        let rows = |first: usize| first..(first + ROWS).min(height);
+        let strips = (0..height).step_by(ROWS).map(|first| Ok(self.band(k, rows(first))?.y(0).to_owned()));
+        let strips = strips.collect::<Result<Vec<Array2<f32>>, SceneError>>()?;
+        let views: Vec<_> = strips.iter().map(|strip| strip.view()).collect();
+        Ok(concatenate(Axis(0), &views).expect("strips of one width"))
+    }
+}
+
+impl Truth {
+    /// What a sensor with this pattern sees of it, `[T, H, W]`, and the color video if it is one.
+    pub fn seen(self, cfa: Option<CfaPattern>) -> (Array3<f32>, Option<Array4<f32>>) {
+        match self {
+            Self::Sensor(x) => (x, None),
+            Self::Rgb(rgb) => {
+                let (t, _, h, w) = rgb.dim();
+                let mut x = Array3::zeros((t, h, w));
+                mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
+                (x, Some(rgb))
+            }
+        }
+    }
+}

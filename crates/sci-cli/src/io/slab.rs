@@ -1,0 +1,338 @@
+//! Owns the reading of a part of an array that is too large to be read whole: some frames, some rows.
+//!
+//! `.npy` files and the members of `.npz` archives that are stored plainly are sought in, packed members are unpacked from their
+//! beginning each time without being kept, and of HDF5 (MATLAB's v7.3 among it) the chunks are read that are needed. What other formats
+//! hold has to be read whole.
+
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use super::npy::{self, Header};
+use super::samples::{Array, Budget, Samples};
+use super::{FileError, Format, ReadError, hdf5};
+
+/// An array on disk.
+#[derive(Clone, Debug)]
+pub struct Stored {
+    path: PathBuf,
+    place: Place,
+    header: Header,
+}
+
+/// Where in its file an array is.
+#[derive(Clone, Debug)]
+enum Place {
+    /// From this byte on, as it is.
+    At(u64),
+    /// A packed member of an archive.
+    Packed(usize),
+    /// A dataset.
+    Dataset(String),
+}
+
+/// The arrays of a file, or of a folder of `.npy` files, and the format that their layout is of.
+#[derive(Clone, Debug)]
+pub struct Arrays {
+    /// By name, in the order of the file.
+    pub named: Vec<(String, Stored)>,
+    /// The format.
+    pub format: Format,
+}
+
+/// The arrays of which parts can be read.
+///
+/// # Errors
+/// A file that cannot be read, or that is damaged; nothing where its format has to be read whole.
+pub fn arrays(path: &Path) -> Result<Option<Arrays>, FileError> {
+    let error = |e| FileError::new(path, e);
+    if path.is_dir() {
+        return in_folder(path);
+    }
+    let mut beginning = vec![0; 1024];
+    let mut file = File::open(path).map_err(|e| error(ReadError::Io(e)))?;
+    let length = read_some(&mut file, &mut beginning).map_err(|e| error(ReadError::Io(e)))?;
+    beginning.truncate(length);
+    match Format::of(&beginning) {
+        Ok(Format::Npy) => {
+            let stored = of_npy(path, &mut BufReader::new(file)).map_err(error)?;
+            let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+            Ok(Some(Arrays { named: vec![(stem, stored)], format: Format::Npy }))
+        }
+        Ok(Format::Npz) => Ok(Some(Arrays { named: in_archive(path, file).map_err(error)?, format: Format::Npz })),
+        Ok(Format::Hdf5 | Format::Mat) if hdf5::is_hdf5(&beginning) => {
+            let (found, of_matlab) = hdf5::headers(path).map_err(error)?;
+            let stored = |(name, header): (String, Header)| {
+                let place = Place::Dataset(name.clone());
+                (name, Stored { path: path.to_owned(), place, header })
+            };
+            let format = if of_matlab || hdf5::is_matlab(&beginning) { Format::Mat } else { Format::Hdf5 };
+            Ok(Some(Arrays { named: found.into_iter().map(stored).collect(), format }))
+        }
+        _ => Ok(None),
+    }
+}
+
+fn in_folder(folder: &Path) -> Result<Option<Arrays>, FileError> {
+    let io = |e| FileError::new(folder, ReadError::Io(e));
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let path = entry.map_err(io)?.path();
+        if path.extension().is_some_and(|e| e == "npy") && path.is_file() {
+            found.extend(arrays(&path)?.into_iter().flat_map(|arrays| arrays.named));
+        }
+    }
+    found.sort_by(|a, b| a.0.cmp(&b.0));
+    Ok(if found.is_empty() { None } else { Some(Arrays { named: found, format: Format::Npy }) })
+}
+
+fn of_npy(path: &Path, file: &mut (impl Read + Seek)) -> Result<Stored, ReadError> {
+    let (header, start) = npy::read_header(file)?;
+    let end = file.seek(SeekFrom::End(0)).map_err(ReadError::Io)?;
+    if end - start < header.bytes() {
+        return Err(header.cut_short(end - start));
+    }
+    Ok(Stored { path: path.to_owned(), place: Place::At(start), header })
+}
+
+fn in_archive(path: &Path, file: File) -> Result<Vec<(String, Stored)>, ReadError> {
+    let broken = |e: zip::result::ZipError| ReadError::Malformed { format: ".npz", reason: e.to_string() };
+    let mut zip = zip::ZipArchive::new(BufReader::new(file)).map_err(broken)?;
+    let mut found = Vec::new();
+    for index in 0..zip.len() {
+        let mut member = zip.by_index(index).map_err(broken)?;
+        let name = member.name().trim_end_matches(".npy").to_owned();
+        let plain = member.compression() == zip::CompressionMethod::Stored;
+        let (start, size) = (member.data_start(), member.size());
+        // What is no array is not a part of a scene either.
+        let Ok((header, length)) = npy::read_header(&mut member) else { continue };
+        if size - length.min(size) < header.bytes() {
+            return Err(header.cut_short(size - length.min(size)));
+        }
+        let place = if plain { Place::At(start + length) } else { Place::Packed(index) };
+        found.push((name, Stored { path: path.to_owned(), place, header }));
+    }
+    Ok(found)
+}
+
+/// As much as there is.
+fn read_some(file: &mut impl Read, mut into: &mut [u8]) -> io::Result<usize> {
+    let all = into.len();
+    while !into.is_empty() {
+        match file.read(into)? {
+            0 => break,
+            n => into = &mut into[n..],
+        }
+    }
+    Ok(all - into.len())
+}
+
+impl Stored {
+    /// The array's shape, as [`Array::shape`] of the whole would be.
+    pub fn shape(&self) -> &[usize] {
+        &self.header.shape
+    }
+
+    /// Bytes of a sample once it is read.
+    pub fn sample_bytes(&self) -> usize {
+        self.header.stored.decoded_size()
+    }
+
+    /// The part of the array within a range of each axis.
+    ///
+    /// # Errors
+    /// The operating system's, and damaged data.
+    ///
+    /// # Panics
+    /// If the ranges are not within the shape.
+    pub fn read(&self, ranges: &[Range<usize>]) -> Result<Array, FileError> {
+        assert_eq!(ranges.len(), self.header.shape.len(), "a range for each axis");
+        let inside = |(range, &length): (&Range<usize>, &usize)| range.start <= range.end && range.end <= length;
+        assert!(ranges.iter().zip(&self.header.shape).all(inside), "ranges within the array");
+        self.read_part(ranges).map_err(|e| FileError::new(&self.path, e))
+    }
+
+    fn read_part(&self, ranges: &[Range<usize>]) -> Result<Array, ReadError> {
+        if let Place::Dataset(name) = &self.place {
+            return hdf5::read_part(&self.path, name, ranges);
+        }
+        let file = BufReader::with_capacity(1 << 20, File::open(&self.path).map_err(ReadError::Io)?);
+        let raw = match self.place {
+            Place::Packed(index) => {
+                let broken = |e: zip::result::ZipError| ReadError::Malformed { format: ".npz", reason: e.to_string() };
+                let mut zip = zip::ZipArchive::new(file).map_err(broken)?;
+                let mut member = zip.by_index(index).map_err(broken)?;
+                npy::read_header(&mut member)?;
+                self.picked(ranges, &mut Unpacked(member))
+            }
+            Place::At(start) => {
+                let mut file = file;
+                file.seek(SeekFrom::Start(start)).map_err(ReadError::Io)?;
+                self.picked(ranges, &mut Sought(file))
+            }
+            Place::Dataset(_) => unreachable!("read above"),
+        };
+        let shape = ranges.iter().map(ExactSizeIterator::len).collect();
+        // What is asked for is what memory there is for.
+        self.header.decode(shape, raw.map_err(ReadError::Io)?, &mut Budget::for_file(usize::MAX))
+    }
+
+    /// The bytes of a part, in the order of the file.
+    fn picked(&self, ranges: &[Range<usize>], from: &mut impl Forward) -> io::Result<Vec<u8>> {
+        let mut axes: Vec<(usize, Range<usize>)> =
+            self.header.shape.iter().copied().zip(ranges.iter().cloned()).collect();
+        if self.header.fortran {
+            axes.reverse();
+        }
+        let mut raw =
+            Vec::with_capacity(self.header.sample() * ranges.iter().map(ExactSizeIterator::len).product::<usize>());
+        let mut at = 0;
+        for run in runs(&axes) {
+            let (start, length) = ((run.start * self.header.sample()) as u64, run.len() * self.header.sample());
+            from.skip(start - at)?;
+            let old = raw.len();
+            raw.resize(old + length, 0);
+            from.read_exact(&mut raw[old..])?;
+            at = start + length as u64;
+        }
+        Ok(raw)
+    }
+}
+
+/// The runs of neighbouring samples of a part, in their order; an axis is its length and the range that is wanted.
+fn runs(axes: &[(usize, Range<usize>)]) -> Vec<Range<usize>> {
+    // Axes after the last that is not wanted whole are read in one go.
+    let last = axes.iter().rposition(|(length, range)| range.len() != *length).unwrap_or(0);
+    let inner: usize = axes.iter().skip(last + 1).map(|(length, _)| length).product();
+    let mut starts = vec![0];
+    for (length, range) in &axes[..last.min(axes.len())] {
+        starts = starts.iter().flat_map(|start| range.clone().map(move |i| start * length + i)).collect();
+    }
+    let Some((length, range)) = axes.get(last) else { return vec![0..1] };
+    starts.iter().map(|start| (start * length + range.start) * inner..(start * length + range.end) * inner).collect()
+}
+
+/// What is read from front to back, some of it passed over.
+trait Forward: Read {
+    fn skip(&mut self, bytes: u64) -> io::Result<()>;
+}
+
+struct Sought(BufReader<File>);
+
+impl Read for Sought {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        self.0.read(into)
+    }
+}
+
+impl Forward for Sought {
+    fn skip(&mut self, bytes: u64) -> io::Result<()> {
+        // Keeps what the buffer holds.
+        self.0.seek_relative(i64::try_from(bytes).map_err(io::Error::other)?)
+    }
+}
+
+struct Unpacked<R>(R);
+
+impl<R: Read> Read for Unpacked<R> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        self.0.read(into)
+    }
+}
+
+impl<R: Read> Forward for Unpacked<R> {
+    fn skip(&mut self, bytes: u64) -> io::Result<()> {
+        let skipped = io::copy(&mut self.0.by_ref().take(bytes), &mut io::sink())?;
+        if skipped == bytes { Ok(()) } else { Err(io::ErrorKind::UnexpectedEof.into()) }
+    }
+}
+
+impl Samples {
+    /// The part within a range of each axis of an array of this shape.
+    #[cfg(test)]
+    fn part(&self, shape: &[usize], ranges: &[Range<usize>]) -> Vec<f32> {
+        let axes: Vec<_> = shape.iter().copied().zip(ranges.iter().cloned()).collect();
+        runs(&axes).into_iter().flatten().map(|i| self.at(i)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{Array3, ShapeBuilder, s};
+    use ndarray_npy::{NpzWriter, WriteNpyExt};
+
+    fn ramp() -> Array3<f32> {
+        Array3::from_shape_fn((4, 5, 6), |(t, y, x)| (100 * t + 10 * y + x) as f32)
+    }
+
+    fn expected() -> Vec<f32> {
+        ramp().slice(s![1..3, 2..5, ..]).iter().copied().collect()
+    }
+
+    fn check(stored: &Stored) {
+        assert_eq!(stored.shape(), [4, 5, 6]);
+        let part = stored.read(&[1..3, 2..5, 0..6]).unwrap();
+        assert_eq!((part.shape(), part.samples()), (&[2, 3, 6][..], &Samples::Floats(expected())));
+        let whole = stored.read(&[0..4, 0..5, 0..6]).unwrap();
+        assert_eq!(whole.samples(), &Samples::Floats(ramp().iter().copied().collect()));
+    }
+
+    #[test]
+    fn parts_of_npy_in_both_orders_and_of_archives_plain_and_packed() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut fortran = Array3::zeros((4, 5, 6).f());
+        fortran.assign(&ramp());
+        for (name, array) in [("c.npy", ramp()), ("fortran.npy", fortran.clone())] {
+            let path = dir.path().join(name);
+            array.write_npy(File::create(&path).unwrap()).unwrap();
+            check(&arrays(&path).unwrap().unwrap().named[0].1);
+        }
+        let path = dir.path().join("a.npz");
+        for packed in [false, true] {
+            let file = File::create(&path).unwrap();
+            let mut npz = if packed { NpzWriter::new_compressed(file) } else { NpzWriter::new(file) };
+            npz.add_array("other", &(ramp() * 2.0)).unwrap();
+            npz.add_array("mask", &fortran).unwrap();
+            npz.finish().unwrap();
+            let found = arrays(&path).unwrap().unwrap().named;
+            assert_eq!(found.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), ["other", "mask"]);
+            check(&found[1].1);
+        }
+        let found = arrays(dir.path()).unwrap().unwrap().named;
+        assert_eq!(found.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), ["c", "fortran"]);
+    }
+
+    #[test]
+    fn parts_of_hdf5_and_of_matlab_v7_3() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.h5");
+        let bytes: Vec<u8> = (0..120).collect();
+        let mut b = hdf5_pure::FileBuilder::new();
+        b.create_dataset("mask").with_u8_data(&bytes).with_shape(&[4, 5, 6]).with_chunks(&[2, 2, 6]).with_deflate(6);
+        b.create_dataset("meas").with_f64_data(&[0.5; 30]).with_shape(&[5, 6]);
+        std::fs::write(&path, b.finish().unwrap()).unwrap();
+        let found = arrays(&path).unwrap().unwrap().named;
+        let mask = &found.iter().find(|(name, _)| name == "mask").unwrap().1;
+        assert_eq!((mask.shape(), mask.sample_bytes()), (&[4, 5, 6][..], 1));
+        let part = mask.read(&[1..3, 2..5, 0..6]).unwrap();
+        let expected = Samples::Bytes(bytes.clone()).part(&[4, 5, 6], &[1..3, 2..5, 0..6]);
+        assert_eq!(part.samples(), &Samples::Bytes(expected.iter().map(|&v| v as u8).collect()));
+        let meas = &found.iter().find(|(name, _)| name == "meas").unwrap().1;
+        assert_eq!(meas.read(&[0..2, 3..6]).unwrap().samples(), &Samples::Floats(vec![0.5; 6]));
+    }
+
+    #[test]
+    fn what_is_cut_short_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npy");
+        let mut bytes = Vec::new();
+        ramp().write_npy(&mut bytes).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() - 1]).unwrap();
+        let error = arrays(&path).unwrap_err().to_string();
+        assert!(error.contains("cut short") && error.contains("a.npy"), "{error}");
+        std::fs::write(&path, "no array").unwrap();
+        assert!(arrays(&path).unwrap().is_none());
+    }
+}
