@@ -12,7 +12,7 @@ use ndarray::{Array3, Array4, ArrayBase, Data, Dimension};
 use ndarray_npy::ReadNpyExt;
 use serde::{Deserialize, Serialize};
 
-use super::{RunFolder, fail, remove};
+use super::{RunFolder, fail, measurement_name, remove};
 use crate::io::npy;
 use crate::io::output::WriteError;
 use crate::record::MeasurementRecord;
@@ -139,7 +139,7 @@ impl RunFolder {
         whole: bool,
         state: impl FnOnce(&Path) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
-        let dir = self.measurement(record.index);
+        let dir = self.staging.join(measurement_name(record.index));
         let temporary = dir.with_extension("tmp");
         let dir = if whole { dir } else { dir.with_extension("stopped") };
         fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
