@@ -1,5 +1,7 @@
 //! What the end-to-end tests share: the built `sci` and a folder to run it in. Their data is found by `test_data`.
 
+mod folders;
+
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,6 +10,8 @@ use std::sync::OnceLock;
 
 use serde_json::Value;
 use tempfile::TempDir;
+
+pub use folders::{assert_same, contents, page_data, wait_for};
 
 /// The root of the workspace.
 ///
@@ -107,10 +111,10 @@ impl Bench {
         names
     }
 
-    /// `sci` with these arguments, about to run in the folder without `SCI_DATA`.
+    /// `sci` with these arguments, about to run in the folder without `SCI_DATA`, and as no task of a job array.
     pub fn command<S: AsRef<OsStr>>(&self, args: &[S]) -> Command {
         let mut command = Command::new(sci());
-        command.current_dir(self.dir.path()).env_remove("SCI_DATA").args(args);
+        command.current_dir(self.dir.path()).env_remove("SCI_DATA").env_remove("SLURM_ARRAY_TASK_ID").args(args);
         command
     }
 

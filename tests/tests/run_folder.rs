@@ -1,7 +1,6 @@
 //! The folder of a run: whatever stops the program, what is solved is there, and what is not the run's is not touched.
 #![cfg(unix)]
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::ffi::OsStringExt;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -9,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{Bench, Finished, sci, workspace};
+use e2e::{Bench, Finished, assert_same, contents, page_data, sci, wait_for, workspace};
 use ndarray::Array3;
 use serde_json::Value;
 
@@ -63,62 +62,6 @@ fn refused(bench: &Bench, arguments: &[&str], needles: &[&str]) {
     assert_eq!(run.code, 2, "{}{}", run.stdout, run.stderr);
     for needle in needles {
         assert!(run.stderr.contains(needle), "{needle:?} is not in: {}", run.stderr);
-    }
-}
-
-/// Every file below a folder, with its bytes; of a record and a page without what depends on the day.
-fn contents(dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut files = BTreeMap::new();
-    let mut folders = vec![dir.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
-            let bytes = fs::read(&path).unwrap();
-            let name = path.strip_prefix(dir).unwrap().to_owned();
-            let bytes = match name.to_str() {
-                Some("record.json") => timeless(&serde_json::from_slice(&bytes).unwrap()).into_bytes(),
-                Some("report.html") => timeless_page(&String::from_utf8(bytes).unwrap()).into_bytes(),
-                _ => bytes,
-            };
-            files.insert(name, bytes);
-        }
-    }
-    files
-}
-
-fn timeless(record: &Value) -> String {
-    let mut record = record.clone();
-    for key in ["peak_rss_bytes", "wall_seconds"] {
-        record[key] = Value::Null;
-    }
-    record["mean"]["seconds"] = Value::Null;
-    for m in record["measurements"].as_array_mut().unwrap() {
-        m["seconds"] = Value::Null;
-        m["trace"]["seconds"] = Value::Null;
-    }
-    record.to_string()
-}
-
-fn page_data(page: &str) -> Value {
-    let (_, rest) = page.split_once("id=\"data\">").unwrap();
-    serde_json::from_str(rest.split_once("</script>").unwrap().0).unwrap()
-}
-
-fn timeless_page(page: &str) -> String {
-    let data = page_data(page);
-    format!("{}{}", timeless(&data["runs"][0]), data["images"])
-}
-
-#[track_caller]
-fn assert_same(found: &Path, expected: &Path) {
-    let (found, expected) = (contents(found), contents(expected));
-    assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
-    for (name, bytes) in &found {
-        assert!(*bytes == expected[name], "{} differs", name.display());
     }
 }
 
@@ -200,15 +143,6 @@ fn networks_that_adapt_go_on_as_they_were() {
     let all = record["measurements"].as_array().unwrap();
     assert!(all.iter().any(|m| m["online"]["counts"]["rolled_back"].as_u64() > Some(0)), "nothing was rolled back");
     assert!(bench.path("killed/adapted-0-ffdnet.safetensors").is_file());
-}
-
-/// Waits until a file is there.
-fn wait_for(path: &Path) {
-    let begin = Instant::now();
-    while !path.exists() {
-        assert!(begin.elapsed() < Duration::from_secs(120), "{} does not come", path.display());
-        std::thread::sleep(Duration::from_millis(2));
-    }
 }
 
 /// A run with its first measurement solved, killed in a later one.

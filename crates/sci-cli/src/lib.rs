@@ -15,6 +15,7 @@ pub mod progress;
 pub mod record;
 pub mod report;
 pub mod run_folder;
+pub mod shard;
 pub mod shipped;
 pub mod simulate;
 pub mod solve;

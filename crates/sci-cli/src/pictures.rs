@@ -15,19 +15,12 @@ use crate::io::scene::{Banded, Scene};
 use crate::io::{frames, video};
 use crate::report;
 use crate::report::pictures::{MeasurementImages, Pictures};
-use crate::run_folder::{Finished, read_video};
+use crate::run_folder::{Finished, PREVIEW, frame_name, read_video};
 
-/// The file of the animated GIF, of a measurement and of the run.
-pub const PREVIEW: &str = "preview.gif";
 /// The file of a measurement's piece of the report.
 pub const PIECE: &str = "report.json";
 /// A preview is halved until its longer side is at most this.
 const PREVIEW_SIDE: usize = 1000;
-
-/// The file of frame `t` of measurement `index`.
-pub fn frame_name(index: usize, t: usize) -> String {
-    format!("m{index:02}_t{t:02}.png")
-}
 
 /// A measurement that has just been solved.
 #[derive(Debug)]
@@ -36,7 +29,7 @@ pub struct Job {
     pub finished: Finished,
     /// Its estimate.
     pub estimate: Estimate,
-    /// Whether no other one follows.
+    /// Whether it is about to be moved into place, as no other one follows.
     pub last: bool,
 }
 
@@ -79,11 +72,11 @@ impl Studio<'_> {
 
     /// Ends, and with it the receiver, with the first error.
     fn make_all(&self, solved: &[Finished], jobs: Receiver<Job>) -> anyhow::Result<()> {
-        for finished in solved.iter().filter(|f| self.is_wanted() && !f.pictures().exists()) {
+        for finished in solved.iter().filter(|f| self.output.has_pictures() && !f.pictures().exists()) {
             self.make(finished, read_video(&finished.video())?.view())?;
         }
         for Job { finished, estimate, last } in jobs {
-            if self.is_wanted() {
+            if self.output.has_pictures() {
                 self.make(&finished, estimate.video())?;
             }
             drop(estimate);
@@ -93,10 +86,6 @@ impl Studio<'_> {
             }
         }
         Ok(())
-    }
-
-    fn is_wanted(&self) -> bool {
-        self.output.frames || self.output.preview || self.output.report
     }
 
     fn make(&self, finished: &Finished, result: ArrayView4<'_, f32>) -> Result<(), WriteError> {

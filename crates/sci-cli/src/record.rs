@@ -52,6 +52,10 @@ pub struct Record {
     /// Wall-clock seconds of the command up to this record; of one that resumed a run, its own.
     #[serde(default)]
     pub wall_seconds: f64,
+    /// The shards that it was solved in, if it was; the run's own memory, threads and seconds are then those of the largest, the
+    /// processors and instruction sets those of all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub shards: Vec<ShardRecord>,
     /// Every other file of the run, relative to the record's folder. A later run may replace and remove these and no others.
     #[serde(default)]
     pub files: Vec<String>,
@@ -61,6 +65,64 @@ pub struct Record {
     /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
     /// what it `extends` and the `--set`s.
     pub config: serde_json::Value,
+}
+
+/// Where a shard of a run was solved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ShardRecord {
+    /// Its number, from 1.
+    pub shard: usize,
+    /// Its measurements, in the order they were solved; what one takes over from the one before the first did not.
+    pub measurements: Vec<usize>,
+    /// The processor's name; of a shard that was resumed elsewhere all of them.
+    pub cpu: String,
+    /// The instruction set, or all of them.
+    pub kernel: String,
+    /// Worker threads, when it was last resumed.
+    pub threads: usize,
+    /// As for a run.
+    pub wall_seconds: f64,
+    /// As for a run.
+    pub peak_rss_bytes: u64,
+}
+
+impl ShardRecord {
+    fn of(shard: usize, record: &Record) -> Self {
+        Self {
+            shard,
+            measurements: record.measurements.iter().map(|m| m.index).collect(),
+            cpu: record.cpu.clone(),
+            kernel: record.kernel.clone(),
+            threads: record.threads,
+            wall_seconds: record.wall_seconds,
+            peak_rss_bytes: record.peak_rss_bytes,
+        }
+    }
+
+    /// The record of a run of which these are the shards, by their numbers and in their order; nothing if there are none.
+    pub fn join(records: Vec<(usize, Record)>) -> Option<Record> {
+        let shards: Vec<Self> = records.iter().map(|(number, record)| Self::of(*number, record)).collect();
+        let all = |text: fn(&Self) -> &str| {
+            let mut names: Vec<&str> = shards.iter().flat_map(|shard| text(shard).split(", ")).collect();
+            names.sort_unstable();
+            names.dedup();
+            names.join(", ")
+        };
+        let (cpu, kernel) = (all(|shard| &shard.cpu), all(|shard| &shard.kernel));
+        let mut records = records.into_iter().map(|(_, record)| record);
+        let mut joined = records.next()?;
+        for record in records {
+            joined.measurements.extend(record.measurements);
+            joined.threads = joined.threads.max(record.threads);
+            joined.peak_rss_bytes = joined.peak_rss_bytes.max(record.peak_rss_bytes);
+            joined.wall_seconds = joined.wall_seconds.max(record.wall_seconds);
+            if joined.precision_used != record.precision_used {
+                joined.precision_used = "mixed".into();
+            }
+        }
+        let mean = MeanRecord::of(&joined.measurements);
+        Some(Record { mean, cpu, kernel, shards, ..joined })
+    }
 }
 
 /// How one measurement went.
@@ -341,6 +403,25 @@ pub(crate) mod tests {
         let mean = MeanRecord::of(&[first, second]);
         assert_eq!((mean.psnr_db, mean.ssim, mean.iterations), (Some(25.76), None, 30.5));
         assert_eq!(MeanRecord::of(&[]), MeanRecord::default());
+    }
+
+    #[test]
+    fn shards_are_one_run_that_says_where_each_was_solved() {
+        let whole: Record = serde_json::from_str(EXAMPLE).unwrap();
+        let part = |index: usize, kernel: &str, threads: usize, seconds: f64| {
+            let mut part = Record { kernel: kernel.into(), threads, wall_seconds: seconds, ..whole.clone() };
+            part.measurements.truncate(1);
+            part.measurements[0].index = index;
+            part
+        };
+        let records = vec![(1, part(4, "avx2", 8, 3.0)), (2, part(6, "avx512, avx2", 2, 5.0))];
+        let joined = ShardRecord::join(records).unwrap();
+        assert_eq!(joined.measurements.iter().map(|m| m.index).collect::<Vec<_>>(), [4, 6]);
+        assert_eq!((joined.kernel.as_str(), joined.threads, joined.wall_seconds), ("avx2, avx512", 8, 5.0));
+        assert_eq!(joined.mean, MeanRecord::of(&joined.measurements));
+        let second = &joined.shards[1];
+        assert_eq!((second.shard, second.measurements.as_slice(), second.threads), (2, &[6][..], 2));
+        assert!(ShardRecord::join(Vec::new()).is_none());
     }
 
     #[test]

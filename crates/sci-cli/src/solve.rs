@@ -137,6 +137,7 @@ pub fn record(
         kernel: factory.kernel()?.to_owned(),
         precision_used: factory.precision_used(halved)?.to_owned(),
         wall_seconds: begin.elapsed().as_secs_f64(),
+        shards: Vec::new(),
         files,
         calibration,
         config: experiment.record_json(),

@@ -12,10 +12,12 @@ macro_rules! outln {
 
 mod calibrate;
 mod completions;
+mod gather;
 mod man;
 mod mask;
 mod metrics;
 mod report;
+mod results;
 mod run;
 mod simulate;
 mod train;
@@ -51,6 +53,11 @@ enum Command {
     /// A measurement is on disk as soon as it is solved. A run that was stopped, by whatever, goes on with --resume, which repeats
     /// at most the measurement in work. Without --resume a folder with a stopped run is refused, so that nothing solved is lost.
     Run(run::Args),
+    /// Join the shards of a run to its results
+    ///
+    /// Shards are made by sci run --shard, on as many machines as there are. Results are those of one machine, byte for byte. If a
+    /// shard is missing nothing is written, and the command that makes it is printed.
+    Gather(gather::Args),
     /// Find how the masks really sit, from measurements alone
     Calibrate(calibrate::Args),
     /// Make masks and measurements from a video
@@ -120,6 +127,7 @@ impl Command {
     fn run(self) -> anyhow::Result<Done> {
         match self {
             Command::Run(args) => args.run(),
+            Command::Gather(args) => args.run(),
             Command::Calibrate(args) => args.run(),
             Command::Simulate(args) => args.run(),
             Command::Mask(args) => args.run(),

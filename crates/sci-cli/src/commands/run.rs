@@ -1,7 +1,7 @@
 //! `sci run`: an experiment from its file to a folder of results.
 
 mod banded;
-mod results;
+mod finishing;
 mod solving;
 mod subject;
 
@@ -13,6 +13,8 @@ use ndarray::Axis;
 use sci_forward::VideoShape;
 use serde_json::json;
 
+use finishing::Ending;
+
 use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::Calibration;
 use crate::config::{self, Experiment, MaskSource, Simulate};
@@ -20,7 +22,8 @@ use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
 use crate::record::host;
-use crate::run_folder::{Finished, RunFolder, RunPlan, Wish, refuse_inputs};
+use crate::run_folder::{self, About, Finished, Layout, RunFolder, RunPlan, Wish, refuse_inputs};
+use crate::shard::{Shard, ranges};
 use crate::simulate::simulate;
 use crate::solve;
 use subject::Subject;
@@ -44,17 +47,27 @@ pub(super) struct Args {
     /// Throw the run away that was stopped in the folder, and begin
     #[arg(long, conflicts_with = "resume")]
     restart: bool,
+    /// Solve part I of N of the measurements, to be joined by sci gather; the same again goes on where it was stopped. A task of a
+    /// Slurm job array is a shard by itself; 1/1 is the whole run, there too
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
 }
 
 impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
         let begin = Instant::now();
+        let shard = self.shard()?;
         let experiment = config::load(&self.config, &self.set)?;
         let out = self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name));
         check_folder(&out)?;
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
         let (mut subject, chosen) = Subject::open(&experiment)?;
+        let own = shard.map_or(&*chosen, |shard| shard.part(&chosen));
+        if let (Some(shard), []) = (shard, own) {
+            outln!("shard {shard} has nothing to do: there are {} measurements", chosen.len());
+            return Ok(Done::Complete);
+        }
         let calibration = match &mut subject {
             Subject::Cut(_) => None,
             Subject::Whole(scene) => {
@@ -66,48 +79,97 @@ impl Args {
         };
         calibration.iter().flat_map(Calibration::lines).for_each(|line| outln!("{line}"));
         let mut factory = Factory::new(&experiment, subject.cfa())?;
-        let shape = subject.result_shape();
-        let all = [chosen.len() * shape[0], shape[1], shape[2], shape[3]];
+        let layout = layout_of(&experiment, &subject, &factory);
+        let all = [chosen.len() * layout.shape[0], layout.shape[1], layout.shape[2], layout.shape[3]];
         experiment.output.format.holds(all).map_err(|e| UsageError(format!("output.format: {e}")))?;
-        let plan = RunPlan {
-            identity: identity(&experiment, &subject, &factory, &chosen)?,
-            files: results::files(&experiment, &factory, shape[0], &chosen),
-            measurements: chosen.clone(),
-        };
+        let plan = self.plan(&experiment, &subject, &factory, &layout, &chosen, shard)?;
         // A folder that cannot be written should not be found out after hours of solving.
-        let Some(mut folder) = RunFolder::open(&out, &plan, self.wish())? else {
+        let Some(mut folder) = RunFolder::open(&out, &plan, self.wish(shard))? else {
             outln!("nothing is unfinished: {} holds the results of this run", out.display());
             return Ok(Done::Complete);
         };
-        self.announce(&experiment, &subject, chosen.len(), &folder, &out);
-        let solved = solve(&experiment, &subject, &chosen, &mut factory, &mut folder);
+        self.announce(&experiment, &subject, own.len(), &folder, &out);
+        if let Some(shard) = shard {
+            announce_shard(shard, own, &chosen, factory.needs_previous());
+        }
+        let solved = solve(&experiment, &subject, (&chosen, own), &mut factory, &mut folder);
         let stopped = folder.finished().iter().filter(|f| f.is_whole()).count();
-        let run = results::Results {
+        let run = Ending {
             experiment: &experiment,
-            shape,
-            unit: subject.unit(),
             factory: &factory,
+            layout: &layout,
             out: &out,
             begin,
             calibration,
+            count: own.len(),
         };
-        let done = solved.and_then(|()| run.finish(folder, chosen.len()));
+        let done = solved.and_then(|()| match shard {
+            None => run.finish(folder),
+            Some(shard) => run.finish_shard(folder, shard),
+        });
         if done.is_err() && stopped > 0 && RunFolder::is_stopped_in(&out) {
-            eprintln!(
-                "{stopped} of {} measurements are kept in {}: add --resume to go on",
-                chosen.len(),
-                out.display()
-            );
+            let how = if shard.is_some() { "the same command goes on" } else { "add --resume to go on" };
+            eprintln!("{stopped} of {} measurements are kept in {}: {how}", own.len(), out.display());
         }
         done
     }
 
-    fn wish(&self) -> Wish {
-        match (self.resume, self.restart) {
-            (true, _) => Wish::Resume,
-            (false, true) => Wish::Restart,
+    /// The shard that is asked for, or that this is as a task of a job array; nothing for the whole run.
+    fn shard(&self) -> Result<Option<Shard>, UsageError> {
+        if let Some(shard) = self.shard {
+            return Ok(Some(shard).filter(|shard| shard.count() > 1));
+        }
+        let shard = Shard::of_slurm(|name| std::env::var(name).ok()).map_err(UsageError)?;
+        if let Some(shard) = shard {
+            outln!(
+                "shard {shard}, as this is a task of a Slurm job array; --shard 1/1 would solve all of the run here"
+            );
+        }
+        Ok(shard)
+    }
+
+    fn wish(&self, shard: Option<Shard>) -> Wish {
+        match (self.resume || shard.is_some(), self.restart) {
+            (_, true) => Wish::Restart,
+            (true, false) => Wish::Resume,
             (false, false) => Wish::New,
         }
+    }
+
+    fn plan(
+        &self,
+        experiment: &Experiment,
+        subject: &Subject,
+        factory: &Factory<'_>,
+        layout: &Layout,
+        chosen: &[usize],
+        shard: Option<Shard>,
+    ) -> anyhow::Result<RunPlan> {
+        let mut identity = identity(experiment, subject, chosen)?;
+        let kernel = factory.kernel()?;
+        let about = About {
+            layout: layout.clone(),
+            reuses: factory.needs_previous(),
+            command: self.command(experiment),
+            cpus: vec![host::cpu()],
+            kernels: vec![kernel.to_owned()],
+            record: None,
+        };
+        // Machines of a cluster differ: of a shard the kernel is told, and in a run it must stay as it was.
+        if shard.is_none() {
+            identity["kernel"] = json!(kernel);
+        }
+        let (files, measurements) = (layout.files(chosen), chosen.to_vec());
+        Ok(RunPlan { identity, files, measurements, shard: shard.map(|shard| (shard, about)) })
+    }
+
+    /// What to call for another shard of this run.
+    fn command(&self, experiment: &Experiment) -> run_folder::Command {
+        let out = self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name));
+        let mut words = vec!["sci".to_owned(), "run".to_owned(), self.config.display().to_string()];
+        self.set.iter().for_each(|set| words.extend(["--set".to_owned(), set.clone()]));
+        words.extend(["--out".to_owned(), out.display().to_string()]);
+        run_folder::Command { folder: std::env::current_dir().unwrap_or_default().display().to_string(), words }
     }
 
     fn announce(&self, experiment: &Experiment, subject: &Subject, count: usize, folder: &RunFolder, out: &Path) {
@@ -129,38 +191,52 @@ impl Args {
     }
 }
 
-/// Solves what is left, with the pictures made meanwhile.
+/// Says which part of the run a shard is, and what is lost with the rest.
+fn announce_shard(shard: Shard, own: &[usize], chosen: &[usize], reuses: bool) {
+    let which = if own.len() == 1 { "measurement" } else { "measurements" };
+    outln!("shard {shard}: {which} {}, {} of {}", ranges(own), own.len(), chosen.len());
+    if reuses && own.first() != chosen.first() {
+        eprintln!(
+            "warning: a measurement takes over from the one before, but {} begins shard {shard} without: the results will not be \
+             those of one machine",
+            ranges(&own[..1])
+        );
+    }
+}
+
+/// Solves what is left of `own`, the part of the `chosen` measurements that is solved here, with the pictures made meanwhile.
 fn solve(
     experiment: &Experiment,
     subject: &Subject,
-    chosen: &[usize],
+    (chosen, own): (&[usize], &[usize]),
     factory: &mut Factory<'_>,
     folder: &mut RunFolder,
 ) -> anyhow::Result<()> {
     let scene = match subject {
         Subject::Whole(scene) => scene,
-        Subject::Cut(cut) => return cut.solve_all(experiment, chosen, factory, folder),
+        Subject::Cut(cut) => return cut.solve_all(experiment, (chosen, own), factory, folder),
     };
     let limit = experiment.output.report_megabytes as usize * 1_000_000;
     let studio = Studio { scene, output: experiment.output, report_bytes: limit / chosen.len().max(1) };
     let before: Vec<Finished> = folder.finished().to_vec();
-    studio.in_step(&before, |show| solving::solve_all(experiment, scene, chosen, factory, folder, show))
+    studio.in_step(&before, |show| solving::solve_all(experiment, scene, own, factory, folder, show))
 }
 
-/// Everything that the bits of a run depend on.
-fn identity(
-    experiment: &Experiment,
-    subject: &Subject,
-    factory: &Factory<'_>,
-    chosen: &[usize],
-) -> anyhow::Result<serde_json::Value> {
+/// Everything that the bits of a run depend on, but for the kernel.
+fn identity(experiment: &Experiment, subject: &Subject, chosen: &[usize]) -> anyhow::Result<serde_json::Value> {
     Ok(json!({
         "version": host::VERSION,
-        "kernel": factory.kernel()?,
         "measurements": chosen,
         "checksum of the data": format!("{:08x}", subject.checksum(chosen)?),
         "config": experiment.to_json(),
     }))
+}
+
+/// What the results are like.
+fn layout_of(experiment: &Experiment, subject: &Subject, factory: &Factory<'_>) -> Layout {
+    let saves = experiment.online.is_some_and(|o| o.save);
+    let weights = if saves { factory.weight_files() } else { Vec::new() };
+    Layout { shape: subject.result_shape(), unit: subject.unit(), output: experiment.output, weights }
 }
 
 /// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted.

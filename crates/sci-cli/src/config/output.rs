@@ -1,10 +1,12 @@
 //! `[output]`: what is written.
 
+use serde::{Deserialize, Serialize};
+
 use crate::io::recon::VideoFormat;
 use crate::table::Table;
 
 /// `[output]`, or `output = "minimal"`: nothing but the reconstruction and the record.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Output {
     /// Format of the reconstruction.
     pub format: VideoFormat,
@@ -30,5 +32,10 @@ impl Output {
             report: t.flag("report", !minimal),
             report_megabytes: t.whole("report_megabytes", 30, 1..=400) as u32,
         }
+    }
+
+    /// Whether pictures are made of each measurement.
+    pub fn has_pictures(&self) -> bool {
+        self.frames || self.preview || self.report
     }
 }

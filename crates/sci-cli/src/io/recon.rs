@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use tiff::encoder::colortype::{ColorType, Gray16, Gray32Float};
 use tiff::encoder::{TiffEncoder, TiffKind};
 use tiff::tags::Tag;
@@ -24,7 +24,7 @@ const LARGE: u64 = 3 << 30;
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
 /// The format of a result.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VideoFormat {
     /// `recon.npy`, `[T, C, H, W]`.

@@ -12,7 +12,7 @@ use ndarray::{Array3, Array4, ArrayBase, Data, Dimension};
 use ndarray_npy::ReadNpyExt;
 use serde::{Deserialize, Serialize};
 
-use super::{RunFolder, fail, remove};
+use super::{RunFolder, fail, measurement_name, remove};
 use crate::io::npy;
 use crate::io::output::WriteError;
 use crate::record::MeasurementRecord;
@@ -141,7 +141,7 @@ impl RunFolder {
         whole: bool,
         state: impl FnOnce(&Path) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
-        let dir = self.measurement(record.index);
+        let dir = self.staging.join(measurement_name(record.index));
         let temporary = dir.with_extension("tmp");
         let dir = if whole { dir } else { dir.with_extension("stopped") };
         fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
@@ -197,7 +197,7 @@ impl RunFolder {
         learned: &Finished,
         write: impl FnOnce(&Path) -> anyhow::Result<MeasurementRecord>,
     ) -> anyhow::Result<()> {
-        let dir = self.measurement(index);
+        let dir = self.staging.join(measurement_name(index));
         let temporary = dir.with_extension("tmp");
         remove(&temporary).map_err(fail(&temporary))?;
         fs::create_dir_all(&temporary).map_err(fail(&temporary))?;
@@ -216,7 +216,7 @@ impl RunFolder {
     }
 
     fn bands(&self, index: usize) -> PathBuf {
-        self.measurement(index).with_extension(BANDS)
+        self.staging.join(measurement_name(index)).with_extension(BANDS)
     }
 }
 

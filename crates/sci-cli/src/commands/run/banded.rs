@@ -26,17 +26,17 @@ pub(super) struct Cut {
 }
 
 impl Cut {
-    /// Solves what is left of `chosen`, until Ctrl-C.
+    /// Solves what is left of `own`, the part of the `chosen` measurements that is solved here, until Ctrl-C.
     pub(super) fn solve_all(
         &self,
         experiment: &Experiment,
-        chosen: &[usize],
+        (chosen, own): (&[usize], &[usize]),
         factory: &mut Factory<'_>,
         folder: &mut RunFolder,
     ) -> anyhow::Result<()> {
         self.pass_solved(factory, folder)?;
         let limit = experiment.output.report_megabytes as usize * 1_000_000 / chosen.len().max(1);
-        for &k in &chosen[folder.finished().len()..] {
+        for &k in &own[folder.finished().len()..] {
             if !self.solve_bands(experiment, k, factory, folder)? {
                 break;
             }

@@ -13,25 +13,25 @@ use crate::record::{MeasurementRecord, Stop};
 use crate::run_folder::RunFolder;
 use crate::solve::{self, Show};
 
-/// Solves what is left of `chosen`, until Ctrl-C. Every solved measurement is in the folder before it is handed to `show`, which
+/// Solves what is left of the measurements `own`, until Ctrl-C. Every solved measurement is in the folder before it is handed to `show`, which
 /// says whether to go on.
 pub(super) fn solve_all(
     experiment: &Experiment,
     scene: &Scene,
-    chosen: &[usize],
+    own: &[usize],
     factory: &mut Factory<'_>,
     folder: &mut RunFolder,
     show: &dyn Fn(Job) -> bool,
 ) -> anyhow::Result<()> {
     let mut previous = pass_solved(scene, factory, folder)?;
     let planned = factory.plan().iterations();
-    for (i, &k) in chosen.iter().enumerate().skip(folder.finished().len()) {
+    for (i, &k) in own.iter().enumerate().skip(folder.finished().len()) {
         if interrupted() {
             break;
         }
         let mut bar = Bar(Progress::new(k, planned));
         let start = previous.as_ref().map(|sensor| sensor.view());
-        let (record, estimate) = solve::measurement(factory, scene, &chosen[i..], start, &mut bar)?;
+        let (record, estimate) = solve::measurement(factory, scene, &own[i..], start, &mut bar)?;
         bar.0.finish();
         outln!("{}", line(&record));
         if record.stop == Stop::Diverged {
@@ -43,7 +43,7 @@ pub(super) fn solve_all(
         })?;
         previous = factory.needs_previous().then(|| estimate.sensor.clone());
         let finished = folder.finished().last().cloned().context("a measurement was stored")?;
-        if !show(Job { finished, estimate, last: i + 1 == chosen.len() }) {
+        if !show(Job { finished, estimate, last: i + 1 == own.len() && !folder.is_shard() }) {
             break;
         }
     }
