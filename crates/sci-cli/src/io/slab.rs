@@ -54,6 +54,7 @@ pub fn arrays(path: &Path) -> Result<Option<Arrays>, FileError> {
     let mut file = File::open(path).map_err(|e| error(ReadError::Io(e)))?;
     let length = read_some(&mut file, &mut beginning).map_err(|e| error(ReadError::Io(e)))?;
     beginning.truncate(length);
+    file.rewind().map_err(|e| error(ReadError::Io(e)))?;
     match Format::of(&beginning) {
         Ok(Format::Npy) => {
             let stored = of_npy(path, &mut BufReader::new(file)).map_err(error)?;
