@@ -31,7 +31,8 @@ fn masks() -> Array3<u8> {
 }
 
 fn video() -> Array3<u8> {
-    let value = |t: usize, y: usize, x: usize| 128.0 + 100.0 * ((t + 3 * x) as f32 * 0.05).sin() * (y as f32 * 0.1).cos();
+    let value =
+        |t: usize, y: usize, x: usize| 128.0 + 100.0 * ((t + 3 * x) as f32 * 0.05).sin() * (y as f32 * 0.1).cos();
     Array3::from_shape_fn(SIZE, |(t, y, x)| value(t, y, x) as u8)
 }
 
@@ -68,7 +69,10 @@ fn bands_join_without_a_seam() {
     works(&bench, &["--out", "whole"]);
     works(&bench, &["--out", "bands", "--set", BANDS]);
     let (whole, bands) = (bench.record("whole"), bench.record("bands"));
-    assert_eq!((&whole["measurements"][0]["bands"].is_null(), bands["measurements"][0]["bands"].as_u64()), (&true, Some(3)));
+    assert_eq!(
+        (&whole["measurements"][0]["bands"].is_null(), bands["measurements"][0]["bands"].as_u64()),
+        (&true, Some(3))
+    );
     assert!(difference(&bench, "whole", "bands") < 1e-4, "{}", difference(&bench, "whole", "bands"));
     for figure in ["psnr_db", "ssim", "ssim_gaussian"] {
         let of = |record: &serde_json::Value| record["measurements"][0][figure].as_f64().unwrap();

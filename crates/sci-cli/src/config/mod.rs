@@ -371,7 +371,11 @@ impl Experiment {
             ("data.raw", data.reading.raw.is_some(), "a file without a header is read as a whole"),
             ("data.calibration", data.calibration != Calibration::None, "masks are calibrated as a whole"),
             ("solver.start", self.solver.start == Start::Previous, "the result before is kept as a whole"),
-            ("online.loss", self.online.is_some() && self.recipe.is_none(), "networks would be updated in every band anew; \"split\" learns once, before the solve"),
+            (
+                "online.loss",
+                self.online.is_some() && self.recipe.is_none(),
+                "networks would be updated in every band anew; \"split\" learns once, before the solve",
+            ),
         ];
         reasons.into_iter().find(|(_, holds, _)| *holds).map(|(key, _, why)| (key, why))
     }

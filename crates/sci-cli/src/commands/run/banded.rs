@@ -85,8 +85,8 @@ impl Cut {
     ) -> anyhow::Result<bool> {
         let (count, middle) = (self.bands.len(), self.bands.middle());
         let learning = experiment.online.is_some();
-        let order = std::iter::once(middle).chain((0..count).filter(|&band| band != middle));
-        for band in order {
+        let first = if learning { middle } else { 0 };
+        for band in std::iter::once(first).chain((0..count).filter(|&band| band != first)) {
             // What was learned is not kept with a band, so that it is learned again.
             if !learning && folder.band(k, band).is_some() {
                 continue;
