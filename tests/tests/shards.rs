@@ -14,6 +14,8 @@ const CONFIG: &str = r#"
 kind = "simulate"
 path = "../video.npy"
 [data.mask]
+kind = "random"
+density = 0.5
 frames = 4
 seed = 1
 [solver]
