@@ -5,7 +5,6 @@ use std::path::Path;
 use ndarray::{Array2, Array3, Axis, Zip};
 
 use super::layout::Place;
-use super::read::array_in;
 use super::source::Source;
 use super::{Reading, SceneError, check_finite, check_size};
 
@@ -85,7 +84,7 @@ fn frame(path: &Path, key: &'static str, reading: &Reading) -> Result<Array3<f32
         (Err(_), Some(raw)) => Source::open(path, Some(raw))?,
         (opened, _) => opened?,
     };
-    let (array, name) = array_in(&source, key.rsplit('.').next().unwrap_or(key), "the frame")?;
+    let (array, name) = source.array(key.rsplit('.').next().unwrap_or(key), "the frame")?;
     let place = Place { file: &source.file, key: &name, format: source.format(), axes: reading.axes };
     let frames = place.frames(&array, 1.0)?;
     check_finite(&source.file, key, frames.view())?;

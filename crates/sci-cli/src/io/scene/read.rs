@@ -194,7 +194,7 @@ fn masks_of(
         wanted = names::resolved(&own, &source.names()?).mask;
         notes.extend(names::notes(&own, &Keys { mask: wanted.clone(), ..own.clone() }));
     }
-    let (array, key) = array_in(source, &wanted, "the masks")?;
+    let (array, key) = source.array(&wanted, "the masks")?;
     let place = Place { file: &source.file, key: &key, format: source.format(), axes: reading.axes };
     let (masks, in_own_unit) = transmittances(&place, &array, reading, field, notes)?;
     let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
@@ -203,21 +203,6 @@ fn masks_of(
         source: source_error,
     })?;
     Ok((checked.view().to_owned(), in_own_unit))
-}
-
-/// The array of this name, or the only one: a file with one array says what it is by being there. With its name.
-pub(super) fn array_in(source: &Source, wanted: &str, part: &'static str) -> Result<(Array, String), SceneError> {
-    if !source.is_named() {
-        return Ok((source.single()?, wanted.to_owned()));
-    }
-    let NamedArrays { names, mut arrays } = source.arrays(&[wanted])?;
-    let found = arrays.remove(wanted).map(|array| (array, wanted.to_owned()));
-    let only = || match names.as_slice() {
-        [only] => Ok(source.arrays(&[only.as_str()])?.arrays.remove(only).map(|array| (array, only.clone()))),
-        _ => Ok::<_, SceneError>(None),
-    };
-    let found = if found.is_some() { found } else { only()? };
-    found.ok_or_else(|| source.missing(wanted, part, names))
 }
 
 /// Masks as transmittances, and whether they were in a unit of their own.
