@@ -261,7 +261,126 @@ fn small_negative_transmittances_are_clipped_with_a_word() {
         clipped.stderr
     );
     assert_eq!(bench.record("out")["mean"]["psnr_db"].as_f64().unwrap(), run(&bench, &[]).0);
-    write(-1.0).unwrap();
-    let refused = bench.sci(&args);
-    assert!(refused.code == 1 && refused.stderr.contains("mask value -1"), "{}", refused.stderr);
+}
+
+/// A differential camera, whose masks are -1 and 1: as good a camera as any, in whatever unit.
+#[test]
+fn masks_of_both_signs_are_taken_as_they_are() {
+    let bench = bench(&["--signed", "--sigma", "1"]);
+    let (first, record) = run(&bench, &[]);
+    assert!(first > 27.0, "{first}");
+    assert_eq!(record["measurements"][0]["stop"], "schedule_done");
+    let made = bench.sci(&["mask", "--out", "mask.npy", "--frames", "6", "--size", "48x48", "--seed", "3", "--signed"]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert_eq!(run(&bench, &["data.mask=mask.npy"]).0, first);
+    let read = |name: &str| {
+        let mut scene = ndarray_npy::NpzReader::new(fs::File::open(bench.path("scene.npz")).unwrap()).unwrap();
+        scene.by_name::<ndarray::OwnedRepr<f32>, ndarray::Ix3>(name).unwrap()
+    };
+    let (mask, meas, orig) = (read("mask"), read("meas"), read("orig"));
+    let write = |of_masks: f32, of_y: f32, with_truth: bool| {
+        let mut file = ndarray_npy::NpzWriter::new(fs::File::create(bench.path("unit.npz")).unwrap());
+        file.add_array("mask", &(&mask * of_masks)).unwrap();
+        file.add_array("meas", &(&meas * of_y)).unwrap();
+        if with_truth {
+            file.add_array("orig", &orig).unwrap();
+        }
+        file.finish().unwrap();
+    };
+    for (of_masks, of_y) in [(1.0, 1e-3), (1.0, 0.3), (1.0, 1e3), (0.1, 1.0), (127.0, 2.0), (255.0, 1e3)] {
+        write(of_masks, of_y, true);
+        let off = run(&bench, &["data.path=unit.npz"]).0 - first;
+        assert!(off.abs() < 0.05, "masks × {of_masks}, y × {of_y}: {off}");
+    }
+    // Without a truth white is found by the light, and the result has the unit of y.
+    let recon = |of_y: f32| {
+        write(1.0, of_y, false);
+        let run =
+            bench.sci(&["run", "a.toml", "--set", "data.path=unit.npz", "--set", "output=minimal", "--out", "out"]);
+        assert!(run.code == 0 && run.stderr.contains("differential camera"), "{}", run.stderr);
+        ndarray_npy::read_npy::<_, ndarray::ArrayD<f32>>(bench.path("out/recon.npy")).unwrap() / of_y
+    };
+    let plain = recon(1.0);
+    for of_y in [1e-3, 50.0] {
+        let off = (recon(of_y) - &plain).mapv(|d| d * d).mean().unwrap().sqrt();
+        assert!(off < 0.02, "y × {of_y}: {off}");
+    }
+}
+
+/// What the light of a pixel decides is left out, and said, where it is not known.
+#[test]
+fn a_differential_camera_knows_its_read_noise() {
+    // Each of the two readings has the noise.
+    let bench = bench(&["--signed", "--sigma", "50"]);
+    let (unaware, _) = run(&bench, &[]);
+    let (aware, _) = run(&bench, &["data.sensor.noise=70.7", "data.sensor.photons=1000"]);
+    assert!(aware > unaware + 0.5, "{unaware} {aware}");
+    let said =
+        bench.sci(&["run", "a.toml", "--out", "out", "--set", "data.sensor.photons=9", "--set", "output=minimal"]);
+    assert!(said.stderr.contains("data.sensor.photons is left out"), "{}", said.stderr);
+}
+
+/// Masks and measurements with an offset and a gain of every pixel's own, which a dark and a white frame take off.
+#[test]
+fn a_dark_and_a_white_frame_make_masks_and_measurements_whole() {
+    let bench = bench(&[]);
+    let (first, _) = run(&bench, &[]);
+    let mut scene = ndarray_npy::NpzReader::new(fs::File::open(bench.path("scene.npz")).unwrap()).unwrap();
+    let mut read = |name: &str| scene.by_name::<ndarray::OwnedRepr<f32>, ndarray::Ix3>(name).unwrap();
+    let (mask, meas, orig) = (read("mask"), read("meas"), read("orig"));
+    let dark = ndarray::Array2::from_shape_fn((48, 48), |(i, j)| 5.0 + ((7 * i + 3 * j) % 11) as f32);
+    let light =
+        ndarray::Array2::from_shape_fn((48, 48), |(i, j)| 200.0 - ((i as f32 - 24.0).powi(2) + j as f32) / 10.0);
+    ndarray_npy::write_npy(bench.path("mask.npy"), &(&mask * &light + &dark)).unwrap();
+    ndarray_npy::write_npy(bench.path("dark.npy"), &dark).unwrap();
+    ndarray_npy::write_npy(bench.path("white.npy"), &(&light + &dark)).unwrap();
+    let mut file = ndarray_npy::NpzWriter::new(fs::File::create(bench.path("raw.npz")).unwrap());
+    file.add_array("meas", &(&meas * 255.0 + &dark)).unwrap();
+    file.add_array("orig", &orig).unwrap();
+    file.finish().unwrap();
+    let raw = ["data.path=raw.npz", "data.mask=mask.npy"];
+    let frames = ["data.sensor.dark=dark.npy", "data.sensor.white=white.npy"];
+    let (without, _) = run(&bench, &raw);
+    let (with, _) = run(&bench, &[&raw[..], &frames].concat());
+    assert!((with - first).abs() < 0.05 && without < first - 1.0, "{first} {with} {without}");
+    // A pixel that sees no white is not measured.
+    let mut dead = &light + &dark;
+    dead[[20, 20]] = dark[[20, 20]];
+    ndarray_npy::write_npy(bench.path("white.npy"), &dead).unwrap();
+    let (with_dead, _) = run(&bench, &[&raw[..], &frames].concat());
+    assert!((with_dead - first).abs() < 0.3, "{first} {with_dead}");
+    let refused = |frame: &str, expected: &[&str], code: i32| {
+        let mut args = vec!["run", "a.toml", "--out", "out"];
+        raw.iter().chain(&frames).chain([&frame]).for_each(|set| args.extend(["--set", set]));
+        let run = bench.sci(&args);
+        assert_eq!(run.code, code, "{}", run.stderr);
+        expected.iter().for_each(|part| assert!(run.stderr.contains(part), "{part}: {}", run.stderr));
+    };
+    ndarray_npy::write_npy(bench.path("small.npy"), &ndarray::Array2::<f32>::ones((4, 5))).unwrap();
+    refused("data.sensor.white=small.npy", &["small.npy", "data.sensor.white", "4×5", "48×48"], 1);
+    refused("data.sensor.dark=gone.npy", &["gone.npy", "data.sensor.dark"], 2);
+    refused("data.sensor.black=3", &["data.sensor.black", "data.sensor.dark"], 2);
+}
+
+/// What pixels show that no mask opens is noise, whatever the scene; where there is none nothing changes.
+#[test]
+fn read_noise_is_found_and_a_clean_scene_is_left_alone() {
+    let clean = bench(&["--density", "0.4"]);
+    assert_eq!(run(&clean, &["data.sensor.noise=auto"]).0, run(&clean, &[]).0);
+    // A twentieth of the pixels is closed.
+    let noisy = bench(&["--sigma", "50", "--density", "0.4"]);
+    let [auto, known, unaware] =
+        ["auto", "50", "0"].map(|noise| run(&noisy, &[&format!("data.sensor.noise={noise}")]).0);
+    assert!((auto - known).abs() < 1.0 && auto > unaware + 0.5, "{auto} {known} {unaware}");
+    let run = noisy.sci(&[
+        "run",
+        "a.toml",
+        "--out",
+        "out",
+        "--set",
+        "data.sensor.noise=auto",
+        "--set",
+        "data.sensor.photons=9",
+    ]);
+    assert!(run.code == 2 && run.stderr.contains("data.sensor.photons"), "{}", run.stderr);
 }

@@ -29,7 +29,8 @@ pub(crate) struct Options {
 /// A scene, and the level below which nine tenths of its first measurement lie.
 const SCENES: [(&str, f64); 2] = [("traffic48", 3.21), ("runner40", 1.93)];
 /// Experiments under configs/, and whether they calibrate by themselves.
-const CONFIGS: [(&str, bool); 3] = [("gray/gap-tv", false), ("gray/default", false), ("real/gray", true)];
+const CONFIGS: [(&str, bool); 4] =
+    [("gray/gap-tv", false), ("gray/default", false), ("gray/fast", false), ("real/gray", true)];
 
 /// A fault: its name, its settings (`FULL` stands for the level of the scene), and whether there is anything to calibrate.
 type Condition = (&'static str, &'static [&'static str], bool);

@@ -2,13 +2,14 @@
 
 use crate::{Estimate, Prior, SolveError, Stage};
 use ndarray::{Array3, ArrayView3, Zip};
-use sci_forward::Measurement;
+use sci_forward::{Measurement, brightness};
 
 /// The video that a solver starts from.
 #[non_exhaustive]
 pub enum Start<'a> {
     /// Every frame is the static scene that fits `y` best: `y Σ_t C_t / (Σ_t C_t)²`, i.e. `y / Σ_t C_t`.
-    /// Pixels that no mask opens get the mean of the others.
+    /// Pixels that no mask opens get the mean of the others. Masks of both signs may add up to nothing: then the scene is taken to be even
+    /// over some pixels too ([`brightness`]).
     Mean,
     /// `Hᵀ y`, the reference code's start. It is not normalised: values reach about `B²/4`.
     Adjoint,
@@ -59,10 +60,18 @@ fn given(video: ArrayView3<'_, f32>, measurement: &Measurement) -> Result<Array3
     Ok(video.as_standard_layout().into_owned())
 }
 
+/// Pixels to each side over which a scene is taken to be even, where a pixel alone says nothing.
+const EVEN: usize = 2;
+
 fn mean(measurement: &Measurement) -> Array3<f32> {
     let (shape, operator) = (measurement.shape(), measurement.operator());
     let open = operator.forward(Array3::ones(shape.dim()).view());
     let measured = || Zip::from(&open).and(measurement.y()).and(operator.gram());
+    // Of transmittances the square of the sum is never less than the sum of the squares.
+    if measured().any(|&open, _, &gram| gram > 0.0 && (open <= 0.0 || open * open < 0.999 * gram)) {
+        let frame = brightness(measurement.y(), open.view(), EVEN);
+        return frame.broadcast(shape.dim()).expect("an image broadcasts over frames").to_owned();
+    }
     let is_open = |open: f32, gram: f32| open > 0.0 && gram > 0.0;
     let (sum, count) = measured().fold((0f64, 0usize), |(sum, count), &open, &y, &gram| {
         if is_open(open, gram) { (sum + f64::from(y / open), count + 1) } else { (sum, count) }

@@ -4,7 +4,7 @@ use admm::*;
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Axis, s};
 use sci_forward::bayer::{Bilinear, CfaPattern, Demosaicer, Malvar, Menon, mosaic_into};
 use sci_forward::testing::{moving_square, uniform};
-use sci_forward::{MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
+use sci_forward::{MaskOperator, MaskStack, Measurement, Noise, SensingOperator, VideoShape};
 use std::sync::Arc;
 
 /// `D(x) = a x`.
@@ -155,26 +155,49 @@ fn the_papers_convention_reaches_its_exact_fixed_point() {
     assert_close(outcome.estimate.rgb.unwrap(), demosaic_matrix(&mut Bilinear).dot(&q), 1e-5);
 }
 
-/// One step of the paper's closed form against a dense solve of `(ρ TᵀT + τ) x = ρ Tᵀ q + Tᵀ b + τ v + w`.
+/// Steps of the paper's closed form against a dense solve of `(ρ TᵀT + τ) x = ρ Tᵀ q + Tᵀ b + τ v + w`, without noise and with, which damps the
+/// data step by n / mse(θ) more.
 #[test]
 fn the_papers_closed_form_is_the_dense_solution() {
     let params = TwoStageParams { rho: 0.55, tau: 10.0, convention: Convention::PaperCode };
-    let (rho, tau) = (0.55f64, 10.0f64);
-    let (h, y) = problem_data(TINY);
-    let (hm, tm, mm) = (h_matrix(&h), t_matrix(), demosaic_matrix(&mut Bilinear));
-    let (a, y64) = (0.95f64, y.mapv(f64::from).flatten().to_owned());
-    // Two iterations by the definition, in f64.
-    let (mut theta, mut b, mut w) = (Array1::<f64>::zeros(32), Array1::<f64>::zeros(32), Array1::<f64>::zeros(96));
-    let mut v = Array1::<f64>::zeros(96);
+    let a = 0.95;
     let start = uniform(TINY.dim(), 6);
-    theta.assign(&start.mapv(f64::from).flatten());
-    let gram = hm.dot(&hm.t());
+    for noise in [None, Some(Noise::new(Some(50.0), 0.1).unwrap())] {
+        let (h, y) = problem_data(TINY);
+        let problem = Measurement::new(h.clone(), y).unwrap().with_noise(noise);
+        let [theta, v] = paper_by_definition(&h, &problem, params, a, &start);
+        let mut solver = TwoStage::new(Scale(a as f32), Bilinear, XStep::ClosedForm { clip: false }, CFA, params);
+        let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 3 }]);
+        let outcome = run(&mut solver, &problem, Start::From(start.view()), &plan, &mut ()).unwrap();
+        assert_close(outcome.estimate.sensor, theta, 1e-5);
+        assert_close(outcome.estimate.rgb.unwrap(), v, 1e-5);
+    }
+}
+
+/// Three iterations of the paper's closed form with `D = a`, by the definition, in `f64`: θ and v.
+fn paper_by_definition(
+    h: &MaskOperator,
+    problem: &Measurement,
+    TwoStageParams { rho, tau, .. }: TwoStageParams,
+    a: f64,
+    start: &Array3<f32>,
+) -> [Array1<f64>; 2] {
+    let (rho, tau) = (f64::from(rho), f64::from(tau));
+    let (hm, tm, mm) = (h_matrix(h), t_matrix(), demosaic_matrix(&mut Bilinear));
+    let flat = |image: Array2<f32>| image.mapv(f64::from).flatten().to_owned();
+    let (y, gram) = (flat(problem.y().to_owned()), flat(h.gram().to_owned()));
+    let noise = problem.variance().map(|n| flat(n.to_owned()));
+    let (mut b, mut w, mut v) = (Array1::<f64>::zeros(32), Array1::<f64>::zeros(96), Array1::<f64>::zeros(96));
+    let mut theta = start.mapv(f64::from).flatten().to_owned();
     for k in 0..3 {
+        let damping = noise.as_ref().map_or(Array1::from_elem(16, rho), |n| {
+            let residual = &y - &hm.dot(&theta);
+            let open: f64 = n.iter().zip(&gram).map(|(n, gram)| if *gram > 0.0 { *n } else { 0.0 }).sum();
+            let mse = ((residual.dot(&residual) - open) / gram.sum()).max(6e-6);
+            n / mse + rho
+        });
         let p = &theta - &b / rho;
-        let mut r = &y64 - &hm.dot(&p);
-        for i in 0..16 {
-            r[i] /= gram[[i, i]] + rho;
-        }
+        let r = (&y - &hm.dot(&p)) / (&gram + &damping);
         let q = &p + &hm.t().dot(&r);
         let x = if k == 0 {
             mm.dot(&(&q + &b / rho))
@@ -188,13 +211,7 @@ fn the_papers_closed_form_is_the_dense_solution() {
         b = b + (if k == 0 { raw } else { q }) - &theta;
         w = w + &x - &v;
     }
-    let mut solver = TwoStage::new(Scale(a as f32), Bilinear, XStep::ClosedForm { clip: false }, CFA, params);
-    let plan = Plan::new([Stage { sigma: Some(0.1), iterations: 3 }]);
-    let outcome =
-        run(&mut solver, &Measurement::new(h.clone(), y.clone()).unwrap(), Start::From(start.view()), &plan, &mut ())
-            .unwrap();
-    assert_close(outcome.estimate.sensor, theta, 1e-5);
-    assert_close(outcome.estimate.rgb.unwrap(), v, 1e-5);
+    [theta, v]
 }
 
 /// A mosaic of a gray scene whose demosaicing is exact (a plane) goes through the color path as through the gray one.

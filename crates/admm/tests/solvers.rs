@@ -72,6 +72,28 @@ fn admm_with_a_linear_denoiser_reaches_its_exact_fixed_point() {
     assert!(worst < 2e-5, "largest difference {worst}");
 }
 
+/// The same where noise of variance n is known of, pixel by pixel another: μ = (γ + n / mse) λ, the mse being that of the fixed point's own
+/// residual.
+#[test]
+fn admm_with_known_noise_reaches_its_exact_fixed_point() {
+    let (lambda, gamma) = (0.3f32, 0.2f32);
+    let problem = measurement().with_noise(Some(sci_forward::Noise::new(Some(40.0), 0.05).unwrap()));
+    let (operator, variance) = (problem.operator(), problem.variance().unwrap());
+    let mut solver = Admm::new(Map(|_: &Call<'_>, x: ArrayView4<'_, f32>| x.mapv(|v| v / (1.0 + lambda))), gamma);
+    let outcome = run(&mut solver, &problem, Start::Mean, &stages(600), &mut ()).unwrap();
+    let found = outcome.estimate.sensor;
+    let residual = &problem.y() - &operator.forward(found.view());
+    let sum = |values: &Array2<f32>| values.iter().map(|&v| f64::from(v)).sum::<f64>();
+    let open = operator.gram().mapv(|gram| if gram > 0.0 { 1.0 } else { 0.0 });
+    let beyond = sum(&(&residual * &residual * &open)) - sum(&(&variance * &open));
+    let mse = (beyond / sum(&operator.gram().to_owned())) as f32;
+    assert!(mse > 1e-4, "the residual is more than noise here: {mse}");
+    let mu = variance.mapv(|n| (gamma + n / mse) * lambda);
+    let exact = operator.adjoint((&problem.y() / &(&operator.gram() + &mu)).view());
+    let worst = (found - exact).fold(0f32, |m, d| m.max(d.abs()));
+    assert!(worst < 2e-5, "largest difference {worst}");
+}
+
 /// With the identity as prior, GAP is a projection: one step reaches `{x : H x = y}`, and further steps stay.
 #[test]
 fn gap_with_no_prior_is_the_projection() {
@@ -405,6 +427,26 @@ fn every_iteration_turns_the_video_another_way_round_and_back() {
     }
 }
 
+/// Masks of both signs add up to nothing at many pixels: the mean start is then that of a scene that is even over a few.
+#[test]
+fn masks_of_both_signs_are_solved_from_every_start() {
+    let shape = VideoShape { frames: 6, height: 48, width: 48 };
+    let truth = moving_square(shape);
+    let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap().differential()));
+    let measurement = Measurement::new(h.clone(), h.forward(truth.view())).unwrap();
+    let plan = |iterations| Plan::new([Stage { sigma: None, iterations }]);
+    let solve = |start: Start<'_>, iterations| {
+        let gap = &mut Gap::accelerated(Tv::new(0.1));
+        rms(&run(gap, &measurement, start, &plan(iterations), &mut ()).unwrap().estimate.sensor, &truth)
+    };
+    let still = solve(Start::Mean, 0);
+    assert!(still < 0.2, "{still}");
+    let (mean, adjoint) = (solve(Start::Mean, 40), solve(Start::Adjoint, 40));
+    assert!(mean < 0.05 && adjoint < 0.08, "{mean} {adjoint}");
+    let admm = run(&mut Admm::new(Tv::new(0.1), 0.01), &measurement, Start::Mean, &plan(60), &mut ()).unwrap();
+    assert!(rms(&admm.estimate.sensor, &truth) < 0.06);
+}
+
 /// With strong noise, a solver that knows of it is far better than one that does not; with none, nothing changes.
 #[test]
 fn noise_that_is_known_is_not_reconstructed() {
@@ -412,22 +454,27 @@ fn noise_that_is_known_is_not_reconstructed() {
     let truth = moving_square(shape);
     let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap()));
     let y = operator.forward(truth.view());
-    let solve = |measurement: &Measurement| {
+    let solve = |solver: &dyn Fn() -> Box<dyn Solver>, measurement: &Measurement| {
         let plan = Plan::new([Stage { sigma: None, iterations: 30 }]);
-        let outcome = run(&mut Gap::accelerated(Tv::new(0.15)), measurement, Start::Mean, &plan, &mut ()).unwrap();
+        let outcome = run(solver().as_mut(), measurement, Start::Mean, &plan, &mut ()).unwrap();
         outcome.estimate.sensor
     };
+    let gap = || Box::new(Gap::accelerated(Tv::new(0.15))) as Box<dyn Solver>;
+    let admm = || Box::new(Admm::new(Tv::new(0.15), 0.01)) as Box<dyn Solver>;
     let error = |x: &ndarray::Array3<f32>| (x - &truth).mapv(|d| d * d).mean().unwrap();
     for sigma in [0.2, 0.4] {
         let noise = sci_forward::Noise::new(None, sigma).unwrap();
         let unaware = Measurement::new(operator.clone(), noise.apply(y.view(), 3)).unwrap();
         let aware = unaware.clone().with_noise(Some(noise));
-        let [unaware, aware] = [&unaware, &aware].map(|measurement| error(&solve(measurement)));
-        assert!(aware < 0.8 * unaware, "σ = {sigma}: {aware} with, {unaware} without");
+        for (name, solver) in [("gap", &gap as &dyn Fn() -> Box<dyn Solver>), ("admm", &admm)] {
+            let [unaware, aware] = [&unaware, &aware].map(|measurement| error(&solve(solver, measurement)));
+            assert!(aware < 0.8 * unaware, "{name}, σ = {sigma}: {aware} with, {unaware} without");
+        }
     }
     let clean = Measurement::new(operator, y).unwrap();
     let silent = clean.clone().with_noise(Some(sci_forward::Noise::new(None, 0.0).unwrap()));
-    assert_eq!(solve(&clean), solve(&silent));
+    assert_eq!(solve(&gap, &clean), solve(&gap, &silent));
+    assert_eq!(solve(&admm, &clean), solve(&admm, &silent));
 }
 
 /// A sensor that clips a tenth of its pixels: one-sided they tell more than left out, and far more than believed.

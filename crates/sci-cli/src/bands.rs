@@ -75,22 +75,22 @@ impl Bands {
     }
 
     /// How many there are.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.edges.len() - 1
     }
 
     /// Whether the scene is one band.
     pub fn is_whole(&self) -> bool {
-        self.len() == 1
+        self.count() == 1
     }
 
     /// The band in the middle.
     pub fn middle(&self) -> usize {
-        self.len() / 2
+        self.count() / 2
     }
 
     fn widened(&self, band: usize, by: usize) -> Range<usize> {
-        let height = self.edges[self.len()];
+        let height = self.edges[self.count()];
         self.edges[band].saturating_sub(by)..(self.edges[band + 1] + by).min(height)
     }
 
@@ -127,7 +127,7 @@ impl Bands {
             (into / MARGIN as f32).clamp(0.0, 1.0)
         };
         let begins = if band == 0 { 1.0 } else { rising(self.edges[band]) };
-        let ends = if band + 1 == self.len() { 0.0 } else { rising(self.edges[band + 1]) };
+        let ends = if band + 1 == self.count() { 0.0 } else { rising(self.edges[band + 1]) };
         begins - ends
     }
 }
@@ -233,14 +233,14 @@ mod tests {
     fn bands_fit_cover_every_row_and_share_it() {
         for memory in [1usize << 30, 2 << 30, 3 << 30] {
             let bands = Bands::new(SHAPE, FOOTPRINT, memory).unwrap();
-            assert!(bands.len() > 1);
-            for band in 0..bands.len() {
+            assert!(bands.count() > 1);
+            for band in 0..bands.count() {
                 let solved = bands.solved(band);
                 assert!(FOOTPRINT.bytes(VideoShape { height: solved.len(), ..SHAPE }) <= memory, "{solved:?}");
                 assert_eq!(solved.start % STEP, 0);
             }
             for row in 0..SHAPE.height {
-                let shares: Vec<f32> = (0..bands.len()).map(|band| bands.share(band, row)).collect();
+                let shares: Vec<f32> = (0..bands.count()).map(|band| bands.share(band, row)).collect();
                 assert!((shares.iter().sum::<f32>() - 1.0).abs() < 1e-6);
                 for (band, share) in shares.iter().enumerate() {
                     assert!(*share >= 0.0 && (*share == 0.0 || bands.kept(band).contains(&row)), "{band} {row}");
@@ -262,9 +262,9 @@ mod tests {
         let shape = VideoShape { frames: 2, height: 700, width: 6 };
         let bands =
             Bands::new(shape, Footprint { of_frame_pixel: 0, of_pixel: 1 << 16 }, PROGRAM + (110 << 20)).unwrap();
-        assert!(bands.len() > 2, "{bands:?}");
+        assert!(bands.count() > 2, "{bands:?}");
         let video = Array4::from_shape_fn((2, 3, 700, 6), |(t, c, y, x)| (t + 2 * c + y * x) as f32 / 4096.0);
-        let paths: Vec<PathBuf> = (0..bands.len()).map(|band| dir.path().join(format!("{band}.npy"))).collect();
+        let paths: Vec<PathBuf> = (0..bands.count()).map(|band| dir.path().join(format!("{band}.npy"))).collect();
         for (band, path) in paths.iter().enumerate() {
             let solved = bands.solved(band);
             let part = bands.cut(band, &video.slice(s![.., .., solved, ..]));

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use admm::Exposure;
 use anyhow::Context;
-use ndarray::{Array2, Zip};
+use ndarray::{Array2, Axis, Zip};
 use sci_forward::{MaskMismatch, MaskOperator, MaskStack};
 use serde::{Deserialize, Serialize};
 
@@ -170,7 +170,7 @@ impl Calibration {
             Some(gains) => Exposure { gains: gains.clone(), uncertainty: 0.0 }.apply(&moved)?,
             None => moved,
         };
-        let open = exposed.sum();
+        let open = exposed.view().mapv(f32::abs).sum_axis(Axis(0));
         let least = HARDLY_OPEN * median(&open);
         let told = Zip::from(&known).and(&open).map_collect(|&known, &open| known && open >= least);
         let mut masks = exposed.view().to_owned();

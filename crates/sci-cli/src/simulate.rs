@@ -1,5 +1,7 @@
 //! Owns simulation for `sci simulate`, `sci mask` and `data.kind = "simulate"`: a camera, from masks and video to what its sensor stores.
 
+use anyhow::Context;
+use ndarray::{Array3, Axis, s};
 use sci_forward::{CfaPattern, Gained, MaskError, MaskMismatch, MaskStack, Readout};
 
 use crate::io::scene::{Keys, Scene, Truth, operator_of};
@@ -54,22 +56,39 @@ pub fn simulate(
     let real = camera.optics.masks(&masks, camera.seed)?;
     let mut readout = camera.readout;
     if readout.bits.is_some() && readout.full.is_infinite() {
-        let brightest = real.sum().iter().copied().fold(0.0, f32::max);
-        readout.full = readout.gain * f64::from(brightest) + readout.black;
+        readout.full = readout.gain * f64::from(real.reach()) + readout.black;
     }
     let differ = real != masks;
     let mut scene = Scene::new(file, keys, real.view().to_owned(), None, Some(truth), cfa)?;
-    scene.measurements = readout.apply(scene.measurements.view(), camera.seed)?;
+    scene.measurements = if real.is_signed() {
+        read_twice(&scene, &real, &readout, camera.seed)?
+    } else {
+        readout.apply(scene.measurements.view(), camera.seed)?
+    };
     if differ {
         scene.operator = operator_of(masks);
     }
     Ok(scene)
 }
 
+/// What a differential camera stores `[N, H, W]`: the sensor reads the light of values above 0 and of those below, and the difference is
+/// taken of the numbers. Black cancels out; noise, an end of the range and steps are of each of the two.
+fn read_twice(scene: &Scene, real: &MaskStack, readout: &Readout, seed: u64) -> anyhow::Result<Array3<f32>> {
+    let y = &scene.measurements;
+    let all = operator_of(MaskStack::new(real.view().mapv(f32::abs))?);
+    let mut both = Array3::zeros((2 * y.len_of(Axis(0)), y.len_of(Axis(1)), y.len_of(Axis(2))));
+    for (k, y) in y.outer_iter().enumerate() {
+        let light = all.forward(scene.truth_of(k).context("a simulated scene has all of its truth")?);
+        both.index_axis_mut(Axis(0), 2 * k).assign(&((&light + &y) / 2.0));
+        both.index_axis_mut(Axis(0), 2 * k + 1).assign(&((&light - &y) / 2.0));
+    }
+    let stored = readout.apply(both.view(), seed)?;
+    Ok(&stored.slice(s![..;2, .., ..]) - &stored.slice(s![1..;2, .., ..]))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array3;
     use sci_forward::{SensingOperator, VideoShape};
 
     const SHAPE: VideoShape = VideoShape { frames: 3, height: 12, width: 16 };
@@ -91,6 +110,26 @@ mod tests {
         let expected = sci_forward::MaskOperator::new(real).forward(told.truth_of(1).unwrap());
         assert_eq!(moved.y(1), expected);
         assert_ne!(moved.y(1), told.y(1));
+    }
+
+    /// Each of two readings has its black level and its noise: the one cancels out, the other adds up.
+    #[test]
+    fn a_differential_camera_is_read_twice() {
+        let masks = MaskStack::random(SHAPE, 0.5, 1).unwrap().differential();
+        let read = |readout| {
+            let truth = Truth::Sensor(Array3::from_shape_fn((6, 12, 16), |(t, i, j)| (t + i + j) as f32 / 40.0));
+            let camera = Camera { readout, ..Camera::default() };
+            simulate("v", &Keys::default(), masks.clone(), truth, None, &camera).unwrap()
+        };
+        let plain = read(Readout { black: 0.3, ..Readout::default() });
+        let off = |scene: &Scene| {
+            let expected = scene.operator.forward(scene.truth_of(1).unwrap());
+            (&scene.y(1) - &expected).mapv(|d| d * d).mean().unwrap().sqrt()
+        };
+        assert!(off(&plain) < 1e-6);
+        let noise = sci_forward::Noise::new(None, 0.1).unwrap();
+        let noisy = off(&read(Readout { noise, ..Readout::default() }));
+        assert!((noisy - 0.02f32.sqrt()).abs() < 0.02, "{noisy}");
     }
 
     #[test]

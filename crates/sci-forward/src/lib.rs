@@ -36,6 +36,7 @@
 //! Wu et al., *Adaptive Deep PnP Algorithm for Video Snapshot Compressive Imaging*, section 2.
 
 pub mod bayer;
+mod brightness;
 mod masked;
 mod masks;
 mod measurement;
@@ -48,6 +49,7 @@ mod readout;
 pub mod testing;
 
 pub use bayer::{CfaPattern, Demosaicer};
+pub use brightness::brightness;
 pub use masked::{BinaryMasks, Gained, MaskOperator, MaskSource, ShiftingMasks};
 pub use masks::{MaskError, MaskStack};
 pub use measurement::{Measurement, MeasurementError};

@@ -22,9 +22,9 @@ pub enum MaskError {
         /// W.
         width: usize,
     },
-    /// A transmittance is negative, NaN, or too large for the sums of its square.
+    /// A value is NaN, or too large for the sums of its square.
     #[error(
-        "mask value {value} at frame {frame}, row {row}, column {column}: a transmittance must be in 0 to {MAX_TRANSMITTANCE:e}"
+        "mask value {value} at frame {frame}, row {row}, column {column}: it must be in -{LARGEST:e} to {LARGEST:e}"
     )]
     Value {
         /// The offending value.
@@ -72,10 +72,11 @@ pub enum MaskError {
     },
 }
 
-/// The largest transmittance, in whatever unit: squares of measurements stay in the range of `f32`.
-const MAX_TRANSMITTANCE: f32 = 1e9;
+/// The largest value, in whatever unit: squares of measurements stay in the range of `f32`.
+const LARGEST: f32 = 1e9;
 
-/// `T` masks `C_t` `[T, H, W]`: transmittances from 0 to 1e9, binary or calibrated in any unit, at least one of them open.
+/// `T` masks `C_t` `[T, H, W]`, binary or calibrated in any unit, at least one of them open: transmittances of 0 to 1e9, or, of a
+/// differential camera, whose measurement is the difference of two, values of either sign down to -1e9.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskStack {
     /// In row-major order.
@@ -91,7 +92,8 @@ impl MaskStack {
     /// ```
     /// use ndarray::array;
     /// assert!(sci_forward::MaskStack::new(array![[[0.0, 1.0], [0.25, 1.0]]]).is_ok());
-    /// assert!(sci_forward::MaskStack::new(array![[[0.0, -1.0]]]).is_err());
+    /// assert!(sci_forward::MaskStack::new(array![[[1.0, -1.0]]]).is_ok());
+    /// assert!(sci_forward::MaskStack::new(array![[[0.0, f32::NAN]]]).is_err());
     /// ```
     pub fn new(masks: Array3<f32>) -> Result<Self, MaskError> {
         let masks = if masks.is_standard_layout() { masks } else { masks.as_standard_layout().into_owned() };
@@ -149,6 +151,18 @@ impl MaskStack {
         Self::from_source(&ShiftingMasks::random(shape, density, seed, [0.0, 1.0])?)
     }
 
+    /// The masks of a differential camera, which measures the light of a mask of 0 to 1 less that of its complement: `2 C − 1`.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// let masks = sci_forward::MaskStack::new(array![[[0.0, 1.0, 0.5]]])?.differential();
+    /// assert_eq!(masks.view(), array![[[-1.0, 1.0, 0.0]]]);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
+    pub fn differential(self) -> Self {
+        Self { masks: self.masks.mapv_into(|c| 2.0 * c - 1.0) }
+    }
+
     /// The size of the video that these masks modulate.
     pub fn shape(&self) -> VideoShape {
         let (frames, height, width) = self.masks.dim();
@@ -160,7 +174,7 @@ impl MaskStack {
         self.masks.view()
     }
 
-    /// Whether every transmittance is 0 or 1.
+    /// Whether every value is 0 or 1.
     ///
     /// ```
     /// use ndarray::array;
@@ -171,6 +185,19 @@ impl MaskStack {
     /// ```
     pub fn is_binary(&self) -> bool {
         self.masks.iter().all(|&v| v == 0.0 || v == 1.0)
+    }
+
+    /// Whether a value is below 0: the masks are those of a differential camera.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// use sci_forward::MaskStack;
+    /// assert!(MaskStack::new(array![[[-1.0, 1.0]]])?.is_signed());
+    /// assert!(!MaskStack::new(array![[[0.0, 0.5]]])?.is_signed());
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
+    pub fn is_signed(&self) -> bool {
+        self.masks.iter().any(|&v| v < 0.0)
     }
 
     #[inline]
@@ -191,6 +218,19 @@ impl MaskStack {
     /// ```
     pub fn sum(&self) -> Array2<f32> {
         self.masks.sum_axis(ndarray::Axis(0))
+    }
+
+    /// The most that a scene within `[0, 1]` measures, or minus the least: the largest sum of values of one sign at a pixel.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// let masks = sci_forward::MaskStack::new(array![[[-1.0, 0.5]], [[-1.0, 1.0]]])?;
+    /// assert_eq!(masks.reach(), 2.0);
+    /// # Ok::<(), sci_forward::MaskError>(())
+    /// ```
+    pub fn reach(&self) -> f32 {
+        let of = |sign: f32| self.masks.mapv(|c| (sign * c).max(0.0)).sum_axis(ndarray::Axis(0));
+        [of(1.0), of(-1.0)].iter().flatten().copied().fold(0.0, f32::max)
     }
 }
 
@@ -218,7 +258,7 @@ fn stored(source: &dyn MaskSource) -> Array3<f32> {
     masks
 }
 
-/// A source that has been checked: not empty, every transmittance in range, at least one open.
+/// A source that has been checked: not empty, every value in range, at least one open.
 pub(crate) fn validated<S: MaskSource>(source: S) -> Result<S, MaskError> {
     let (frames, height, width) = source.shape().dim();
     if frames * height * width == 0 {
@@ -228,10 +268,10 @@ pub(crate) fn validated<S: MaskSource>(source: S) -> Result<S, MaskError> {
     let mut largest = 0f32;
     for (frame, row) in (0..frames).flat_map(|t| (0..height).map(move |row| (t, row))) {
         source.fill(frame, row, 0, &mut values);
-        if let Some(column) = values.iter().position(|v| !(0.0..=MAX_TRANSMITTANCE).contains(v)) {
+        if let Some(column) = values.iter().position(|v| !(-LARGEST..=LARGEST).contains(v)) {
             return Err(MaskError::Value { value: values[column], frame, row, column });
         }
-        largest = values.iter().fold(largest, |largest, &v| largest.max(v));
+        largest = values.iter().fold(largest, |largest, &v| largest.max(v.abs()));
     }
     if largest * largest <= CLOSED { Err(MaskError::AllClosed) } else { Ok(source) }
 }

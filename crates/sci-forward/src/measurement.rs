@@ -96,7 +96,8 @@ impl Measurement {
     }
 
     /// The same measurement with noise that solvers are to know of: they then explain y as closely as the noise allows, not exactly. The
-    /// shot noise of a pixel is that of its measured light. Noise that has no variance anywhere is none.
+    /// shot noise of a pixel is that of its measured light, of which y says little if masks have both signs: read noise is all that should be
+    /// given then. Noise that has no variance anywhere is none.
     ///
     /// ```
     /// use ndarray::{Array3, array};

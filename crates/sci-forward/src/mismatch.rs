@@ -52,7 +52,7 @@ impl Default for MaskMismatch {
 }
 
 impl MaskMismatch {
-    /// The masks on the sensor, of those that were told. Negative transmittances become 0.
+    /// The masks on the sensor, of those that were told. What becomes negative of masks that are not is 0.
     ///
     /// # Errors
     /// [`MaskError`] if a value is then out of range (a parameter is not finite), or nothing is open.
@@ -78,8 +78,10 @@ impl MaskMismatch {
         for (frame, end) in [0, last].into_iter().zip(self.ends).filter(|(_, end)| *end != 0.0) {
             moved.index_axis_mut(Axis(0), frame).mapv_inplace(|c| c + end as f32);
         }
-        // Not `max`: a NaN is to be refused.
-        moved.mapv_inplace(|c| if c < 0.0 { 0.0 } else { c });
+        if !masks.is_signed() {
+            // Not `max`: a NaN is to be refused.
+            moved.mapv_inplace(|c| if c < 0.0 { 0.0 } else { c });
+        }
         MaskStack::new(moved)
     }
 

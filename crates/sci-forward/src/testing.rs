@@ -51,13 +51,13 @@ pub fn moving_square(shape: VideoShape) -> Array3<f32> {
     })
 }
 
-/// Binary, calibrated and partly closed masks of one shape: the families that every operator test goes through.
+/// Binary, calibrated, partly closed and signed masks of one shape: the families that every operator test goes through.
 ///
 /// ```
 /// use sci_forward::{VideoShape, testing::mask_families};
 /// let families = mask_families(VideoShape { frames: 4, height: 5, width: 6 }, 0);
 /// assert!(families[0].is_binary() && !families[1].is_binary());
-/// assert!(families[2].sum().iter().any(|sum| *sum == 0.0));
+/// assert!(families[2].sum().iter().any(|sum| *sum == 0.0) && families[3].is_signed());
 /// ```
 ///
 /// # Panics
@@ -72,7 +72,9 @@ pub fn mask_families(shape: VideoShape, seed: u64) -> Vec<MaskStack> {
     binary[[0, 0, 0]] = 1.0;
     let mut float = float;
     float[[0, 0, 0]] = 0.5;
-    [binary, float, closed].map(|masks| MaskStack::new(masks).expect("one value is open, all are in [0, 1]")).into()
+    let signed = binary.mapv(|c| 2.0 * c - 1.0);
+    let families = [binary, float, closed, signed];
+    families.map(|masks| MaskStack::new(masks).expect("one value is open, all are in [-1, 1]")).into()
 }
 
 /// `|⟨H x, y⟩ − ⟨x, Hᵀ y⟩| / max(‖H x‖ ‖y‖, ‖x‖ ‖Hᵀ y‖)` for random `x` and `y`, summed in `f64`: 0 for an exact adjoint.
@@ -93,7 +95,7 @@ pub fn adjoint_gap(operator: &dyn SensingOperator, seed: u64) -> f64 {
     (left - right).abs() / scale.max(f64::MIN_POSITIVE)
 }
 
-/// Holds a source of masks to its promises: values in 0 to 1e9, the same in pieces as in a whole row, and as they are stored.
+/// Holds a source of masks to its promises: values in -1e9 to 1e9, the same in pieces as in a whole row, and as they are stored.
 ///
 /// # Panics
 /// If a promise is broken.
@@ -108,7 +110,7 @@ pub fn check_source(source: &dyn MaskSource) {
     let (mut whole, mut pieces) = (vec![f32::NAN; width], vec![f32::NAN; width]);
     for (frame, row) in (0..frames).flat_map(|t| (0..height).map(move |row| (t, row))) {
         source.fill(frame, row, 0, &mut whole);
-        let outside = whole.iter().position(|v| !(0.0..=1e9).contains(v));
+        let outside = whole.iter().position(|v| !(-1e9..=1e9).contains(v));
         assert_eq!(outside.map(|column| whole[column]), None, "frame {frame}, row {row}");
         if let Some(stored) = source.stored(frame, row) {
             assert_eq!(stored, whole, "frame {frame}, row {row} as it is stored");

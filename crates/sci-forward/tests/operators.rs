@@ -4,8 +4,8 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 use proptest::prelude::*;
 use sci_forward::testing::{Sheared, adjoint_gap, check_source, gaussian, mask_families, uniform};
 use sci_forward::{
-    BinaryMasks, Gained, MaskError, MaskOperator, MaskSource, MaskStack, Restricted, SensingOperator, ShiftingMasks,
-    VideoShape,
+    BinaryMasks, Gained, MaskError, MaskMismatch, MaskOperator, MaskSource, MaskStack, Restricted, SensingOperator,
+    ShiftingMasks, VideoShape,
 };
 use std::sync::Arc;
 
@@ -100,6 +100,10 @@ fn packed_masks_are_the_masks() {
         let masks = MaskStack::new(mask_families(shape, 4)[0].view().mapv(|v| 3.0 * v)).unwrap();
         assert_eq!(MaskStack::from_source(&BinaryMasks::new(&masks).unwrap()).unwrap(), masks, "{width}");
     }
+    let below = MaskStack::new(ndarray::array![[[0.0, -2.0, -2.0]]]).unwrap();
+    assert_eq!(MaskStack::from_source(&BinaryMasks::new(&below).unwrap()).unwrap(), below);
+    let both = MaskStack::new(ndarray::array![[[1.0, -1.0]]]).unwrap();
+    assert_eq!(BinaryMasks::new(&both), Err(MaskError::NotBinary { value: -1.0, open: 1.0 }));
     let masks = MaskStack::new(ndarray::array![[[0.0, 0.5, 0.25]]]).unwrap();
     assert_eq!(BinaryMasks::new(&masks), Err(MaskError::NotBinary { value: 0.25, open: 0.5 }));
 }
@@ -140,9 +144,17 @@ fn a_bad_movement_is_named() {
     assert!(matches!(ShiftingMasks::random(shape, 0.5, 0, [f64::NAN, 0.0]), Err(MaskError::Offset { .. })));
     assert_eq!(ShiftingMasks::random(shape, 0.0, 0, [1.0, 0.0]), Err(MaskError::Density(0.0)));
     let mut pattern = Array2::ones((3, 4));
-    pattern[[2, 3]] = -1.0;
+    pattern[[2, 3]] = -1e10;
     let error = ShiftingMasks::new(pattern, &[[0.0, 0.0], [0.5, 0.0]]).unwrap_err();
-    assert!(error.to_string().contains("-1 at frame 0, row 2, column 3"), "{error}");
+    assert!(error.to_string().contains("-10000000000 at frame 0, row 2, column 3"), "{error}");
+}
+
+#[test]
+fn masks_of_both_signs_move_and_fade_with_their_signs() {
+    let masks = MaskStack::new(ndarray::array![[[-1.0, 1.0, 1.0, -1.0]]]).unwrap();
+    let seen = MaskMismatch { shift: [0.0, 0.5], contrast: 0.5, ..MaskMismatch::default() }.apply(&masks).unwrap();
+    // Moved: -1, 0, 1, 0, with the mean 0.
+    assert_eq!(seen.view(), ndarray::array![[[-0.5, 0.0, 0.5, 0.0]]]);
 }
 
 #[test]
@@ -150,7 +162,7 @@ fn a_bad_gain_is_named() {
     let ones = || MaskStack::new(Array3::ones((2, 1, 1))).unwrap();
     let message = |gain: Vec<f32>| Gained::new(ones(), gain).unwrap_err().to_string();
     assert_eq!(message(vec![1.0]), "1 gains for 2 frames: each frame has one");
-    assert!(message(vec![1.0, -0.5]).contains("-0.5 at frame 1"));
+    assert!(message(vec![1.0, f32::NAN]).contains("NaN at frame 1"));
     assert!(message(vec![1.0, 1e10]).contains("10000000000 at frame 1"));
     assert!(message(vec![0.0, 0.0]).contains("nothing reaches the sensor"));
 }

@@ -22,7 +22,7 @@ const VIDEO: &str = "[T, H, W]";
 /// Parameters
 /// ----------
 /// masks : array, [T, H, W]
-///     Transmittances, at least 0 (usually up to 1). Stored as a bit a pixel where all are 0 or 1.
+///     Transmittances, usually 0 to 1; of a differential camera of both signs. Stored as a bit a pixel where all are 0 or 1.
 #[pyclass(frozen, module = "sci")]
 pub(crate) struct MaskOperator {
     pub(crate) operator: Arc<dyn SensingOperator>,

@@ -5,8 +5,8 @@
 //! the pattern as it is then; both put light into the first and last frames that is not theirs. The held-out error does not see a gain: a
 //! frame that is brighter explains as much.
 
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, Zip, s};
-use sci_forward::{MaskError, MaskStack};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
+use sci_forward::{MaskError, MaskStack, brightness};
 
 /// Pixels to each side over which a scene is to be even.
 const RADIUS: usize = 4;
@@ -201,8 +201,7 @@ impl Regression {
 /// The pixels of a measurement around which it is even.
 fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, open: &Array2<f32>) -> Vec<Pixel> {
     let (height, width) = y.dim();
-    let mut brightness = box_sum(&(y * open));
-    Zip::from(&mut brightness).and(&box_sum(&(open * open))).for_each(|u, &s| *u /= s.max(1e-6));
+    let brightness = brightness(y.view(), open.view(), RADIUS);
     let middle = brightness.mean().unwrap_or(0.0);
     let mut pixels = Vec::new();
     for i in 2 * RADIUS + 1..height.saturating_sub(2 * RADIUS + 1) {
@@ -219,22 +218,6 @@ fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, open: &Array2<f32>) -> Vec<Pi
         }
     }
     pixels
-}
-
-/// Sums over a square around each pixel, what of it is inside.
-fn box_sum(image: &Array2<f32>) -> Array2<f32> {
-    let (height, width) = image.dim();
-    let mut sums = Array2::<f64>::zeros((height + 1, width + 1));
-    for i in 0..height {
-        for j in 0..width {
-            sums[[i + 1, j + 1]] = f64::from(image[[i, j]]) + sums[[i, j + 1]] + sums[[i + 1, j]] - sums[[i, j]];
-        }
-    }
-    Array2::from_shape_fn((height, width), |(i, j)| {
-        let (top, left) = (i.saturating_sub(RADIUS), j.saturating_sub(RADIUS));
-        let (bottom, right) = ((i + RADIUS + 1).min(height), (j + RADIUS + 1).min(width));
-        (sums[[bottom, right]] - sums[[top, right]] - sums[[bottom, left]] + sums[[top, left]]) as f32
-    })
 }
 
 /// The lower triangle L of `A = L Lᵀ`.

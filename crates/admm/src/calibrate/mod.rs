@@ -222,7 +222,7 @@ struct Judge<'a> {
     measurements: &'a [Array2<f32>],
     /// The group of a held-out pixel.
     groups: Array2<Option<u8>>,
-    /// Mean of y.
+    /// Mean of |y|.
     level: f64,
     /// Σ y² over the held-out pixels.
     power: f64,
@@ -249,7 +249,7 @@ impl<'a> Judge<'a> {
             Zip::from(y).and(&groups).fold(0.0, |sum, &y, group| sum + group.map_or(0.0, |_| f64::from(y).powi(2)))
         };
         let power = measurements.iter().map(held_out).sum::<f64>().max(f64::MIN_POSITIVE);
-        let sum: f64 = measurements.iter().flatten().map(|&y| f64::from(y)).sum();
+        let sum: f64 = measurements.iter().flatten().map(|&y| f64::from(y.abs())).sum();
         let level = sum / measurements.iter().map(Array2::len).sum::<usize>().max(1) as f64;
         Ok(Self { masks, cfa, measurements, groups, level, power })
     }

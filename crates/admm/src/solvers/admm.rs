@@ -1,5 +1,6 @@
 //! The alternating direction method of multipliers with one splitting.
 
+use super::known::Known;
 use crate::{Call, DataStep, Estimate, Prior, PriorError, Progress, Solver};
 use ndarray::Array3;
 use sci_forward::Measurement;
@@ -13,6 +14,9 @@ use sci_forward::Measurement;
 /// ```
 ///
 /// The estimate is `θ`, not clipped. `γ = 0` with `b = 0` is plain GAP.
+///
+/// Where noise of variance n is known of ([`Measurement::with_noise`]), y is not explained more closely than it allows: diag(H Hᵀ) + γ becomes
+/// diag(H Hᵀ) + γ + n / mse(θ), the error of θ being what its residual has beyond the noise.
 ///
 /// All that is kept between iterations is `z = x − b`, the prior's input: with it `b = θ − z`, so that the data step and both
 /// subtractions are one pass, `z ← θ + Hᵀ (y − H (2θ − z)) / (diag(H Hᵀ) + γ)` (Douglas and Rachford's form of ADMM).
@@ -43,7 +47,8 @@ impl<P: Prior> Admm<P> {
     fn data_step(&mut self, measurement: &Measurement, previous: &Estimate, theta: &Estimate) -> Progress {
         let Self { gamma, z, next_z, .. } = self;
         let previous = Some(previous.sensor.view());
-        let step = DataStep { damping: *gamma, mirror: Some(z.view()), previous, ..DataStep::default() };
+        let precision = Known::of(measurement, theta.sensor.view()).precision;
+        let step = DataStep { damping: *gamma, precision, mirror: Some(z.view()), previous, ..DataStep::default() };
         let progress = step.apply(measurement, theta.sensor.view(), next_z.view_mut());
         std::mem::swap(z, next_z);
         progress

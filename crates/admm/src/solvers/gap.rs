@@ -1,7 +1,8 @@
 //! Generalised alternating projection.
 
-use crate::{Call, DataStep, Estimate, Prior, PriorError, Progress, Solver, progress};
-use ndarray::{Array2, Array3, Zip};
+use super::known::Known;
+use crate::{Call, DataStep, Estimate, Prior, PriorError, Progress, Solver};
+use ndarray::{Array2, Array3};
 use sci_forward::Measurement;
 
 /// Where the accumulated measurement `y1` of accelerated GAP starts.
@@ -72,11 +73,11 @@ impl<P: Prior> Gap<P> {
 
     /// The x of the next iteration from the v of this one. Without noise it reads v once for the projection and for how far v has come.
     fn project(&mut self, measurement: &Measurement, previous: &Estimate, v: &Estimate) -> Progress {
-        let known = Known::of(measurement, v);
+        let Known { precision, within_noise } = Known::of(measurement, v.sensor.view());
         let step = DataStep {
             momentum: self.y1.as_mut(),
-            hold_momentum: known.is_some_and(|known| known.within_noise),
-            precision: known.map_or(0.0, |known| known.precision),
+            hold_momentum: within_noise,
+            precision,
             previous: Some(previous.sensor.view()),
             ..DataStep::default()
         };
@@ -95,31 +96,6 @@ impl<P: Prior> Gap<P> {
             y1.assign(&measurement.y());
             DataStep::default().apply(measurement, v.sensor.view(), self.x.view_mut());
         }
-    }
-}
-
-/// How well v is known, from its residual and the noise: `Σ r² ≈ Σ n + mse · Σ diag(H Hᵀ)` over the open pixels.
-#[derive(Clone, Copy)]
-struct Known {
-    /// 1 / mse.
-    precision: f32,
-    /// Whether noise alone would leave as large a residual.
-    within_noise: bool,
-}
-
-/// The least mean square error that a video is taken to have, 52 dB: the residual of one that has nearly as much as the noise alone says no
-/// more.
-const LEAST_ERROR: f64 = 6e-6;
-
-impl Known {
-    fn of(measurement: &Measurement, v: &Estimate) -> Option<Self> {
-        let (variance, gram) = (measurement.variance()?, measurement.operator().gram());
-        let (noise, open) = Zip::from(variance).and(gram).fold((0f64, 0f64), |(noise, open), &n, &gram| {
-            if gram > 0.0 { (noise + f64::from(n), open + f64::from(gram)) } else { (noise, open) }
-        });
-        let residual = progress(measurement, v.sensor.view(), v.sensor.view()).residual;
-        let error = ((residual - noise) / open).max(LEAST_ERROR);
-        Some(Self { precision: (1.0 / error) as f32, within_noise: residual <= noise })
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod admm;
 mod gap;
+mod known;
 mod two_stage;
 mod warm_start;
 

@@ -1,5 +1,6 @@
 //! The paper's two-stage ADMM for color sensors.
 
+use super::known::Known;
 use crate::priors::clip;
 use crate::{Call, DataStep, Denoiser, Estimate, PriorError, Progress, Solver, progress};
 use ndarray::parallel::prelude::*;
@@ -70,6 +71,9 @@ pub struct TwoStageParams {
 
 /// Two-stage ADMM: stage one recovers the mosaic video from the measurement, stage two the RGB video from the mosaic.
 /// The updates are those of its [`Convention`].
+///
+/// Where noise of variance n is known of ([`Measurement::with_noise`]), q is the likeliest mosaic: diag(H Hᵀ) + ρ becomes
+/// diag(H Hᵀ) + ρ + n / mse(θ), as in [`Admm`](crate::Admm).
 ///
 /// The estimate is `θ = T v` (`[T, H, W]`, clipped in the paper's convention), its RGB video is `v`, not clipped.
 ///
@@ -146,7 +150,8 @@ impl Kept {
         let Self { tx, q, b, mosaic, .. } = self;
         let closing = tx.as_ref().unwrap_or(theta);
         Zip::from(&mut *mosaic).and(closing).and(&*b).par_for_each(|p, &closing, &b| *p = closing - b / b_scale);
-        let step = DataStep { damping: params.rho, ..DataStep::default() };
+        let precision = Known::of(measurement, theta.view()).precision;
+        let step = DataStep { damping: params.rho, precision, ..DataStep::default() };
         step.apply(measurement, mosaic.view(), q.view_mut());
         Zip::from(&mut *mosaic).and(&*q).and(&*b).par_for_each(|m, &q, &b| *m = q + b / b_scale);
     }

@@ -28,6 +28,9 @@ pub(super) struct Args {
     /// Share of open pixels, 0.001 to 1
     #[arg(long, default_value = "0.5", value_parser = parse_density)]
     density: f64,
+    /// Of a differential camera: pixels that are not open are -1 instead of 0
+    #[arg(long)]
+    signed: bool,
     /// Seed
     #[arg(long, default_value = "0")]
     seed: u64,
@@ -47,11 +50,12 @@ pub(super) enum Kind {
 }
 
 impl Kind {
-    pub(super) fn masks(self, shape: VideoShape, density: f64, seed: u64) -> anyhow::Result<MaskStack> {
-        Ok(match self {
+    pub(super) fn masks(self, shape: VideoShape, density: f64, signed: bool, seed: u64) -> anyhow::Result<MaskStack> {
+        let masks = match self {
             Self::Random => MaskStack::random(shape, density, seed)?,
             Self::Shifting => MaskStack::shifting(shape, density, seed)?,
-        })
+        };
+        Ok(if signed { masks.differential() } else { masks })
     }
 }
 
@@ -60,7 +64,7 @@ impl Args {
         let format = array_format(&self.out)?;
         let shape = VideoShape { frames: self.frames.into(), height: self.size.0, width: self.size.1 };
         let optics = optics_of_arguments(&self.set)?;
-        let masks = optics.masks(&self.kind.masks(shape, self.density, self.seed)?, self.seed)?;
+        let masks = optics.masks(&self.kind.masks(shape, self.density, self.signed, self.seed)?, self.seed)?;
         let data = masks.view().insert_axis(Axis(1));
         write_arrays(&self.out, format, &[Part { name: "mask", data, is_light: false }])?;
         let open = masks.view().iter().filter(|&&c| c > 0.0).count() as f64 / masks.view().len() as f64;

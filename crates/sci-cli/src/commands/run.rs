@@ -17,7 +17,7 @@ use finishing::Ending;
 
 use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::Calibration;
-use crate::config::{self, Experiment, MaskSource, Simulate};
+use crate::config::{self, Experiment, MaskSource, RandomMask, Simulate};
 use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
@@ -275,9 +275,10 @@ fn masks(
 ) -> anyhow::Result<sci_forward::MaskStack> {
     use sci_forward::MaskStack;
     let shape = |frames| VideoShape { frames, height, width };
+    let of = |r: &RandomMask, masks: MaskStack| if r.signed { masks.differential() } else { masks };
     Ok(match &s.mask {
-        MaskSource::Random(r) => MaskStack::random(shape(r.frames), r.density, r.seed)?,
-        MaskSource::Shifting(r) => MaskStack::shifting(shape(r.frames), r.density, r.seed)?,
+        MaskSource::Random(r) => of(r, MaskStack::random(shape(r.frames), r.density, r.seed)?),
+        MaskSource::Shifting(r) => of(r, MaskStack::shifting(shape(r.frames), r.density, r.seed)?),
         MaskSource::File(path) => {
             let (masks, said) = scene::read_mask(path, reading)?;
             notes.extend(said);

@@ -28,7 +28,7 @@ pub(super) struct Args {
     #[arg(long, value_enum, default_value = "random")]
     mask: Kind,
     /// Take the masks from a file instead: .npy, .npz, .h5, .mat, .tif or a folder of pictures
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["mask", "frames", "density"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["mask", "frames", "density", "signed"])]
     mask_file: Option<PathBuf>,
     /// Frames a measurement sums
     #[arg(long, default_value = "8", value_name = "B", value_parser = clap::value_parser!(u16).range(2..=1024))]
@@ -36,6 +36,9 @@ pub(super) struct Args {
     /// Share of open pixels, 0.001 to 1
     #[arg(long, default_value = "0.5", value_parser = parse_density)]
     density: f64,
+    /// A differential camera: pixels of the masks that are not open are -1 instead of 0, and the difference of two readings is measured
+    #[arg(long)]
+    signed: bool,
     /// Measurements to make [default: as many as the video fills]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     measurements: Option<u32>,
@@ -115,7 +118,8 @@ impl Args {
                 masks
             }
             None => {
-                self.mask.masks(VideoShape { frames: self.frames.into(), height, width }, self.density, self.seed)?
+                let shape = VideoShape { frames: self.frames.into(), height, width };
+                self.mask.masks(shape, self.density, self.signed, self.seed)?
             }
         };
         if let Some(n) = self.measurements {

@@ -8,7 +8,7 @@ use serde_json::json;
 use super::camera;
 use crate::io::defects::Defects;
 use crate::io::raw::{Packing, Raw};
-use crate::io::scene::{Axes, Clip, Keys, MaskShift, Reading, Sensor};
+use crate::io::scene::{Axes, Clip, Keys, MaskShift, Reading, Sensor, SensorNoise};
 use crate::simulate::Camera;
 use crate::table::{ConfigError, Table, as_number};
 
@@ -65,6 +65,8 @@ pub struct RandomMask {
     pub frames: usize,
     /// Open fraction.
     pub density: f64,
+    /// Whether pixels that are not open are -1, of a differential camera.
+    pub signed: bool,
     /// Seed.
     pub seed: u64,
 }
@@ -92,7 +94,7 @@ impl Data {
                 mask,
                 shift: mask_shift(t, simulated),
                 raw: if t.holds("raw") { Some(t.part("raw", |t| Ok(raw(t)))?) } else { None },
-                sensor: t.part("sensor", |t| Ok(sensor(t)))?,
+                sensor: t.part("sensor", |t| Ok(sensor(t, simulated)))?,
                 ..Reading::default()
             },
             simulate,
@@ -110,7 +112,10 @@ impl Data {
             Calibration::File(path) => Some(("data.calibration", path.as_path())),
             _ => None,
         };
-        mask.into_iter().chain(calibration)
+        let sensor = &self.reading.sensor;
+        let frames = [("data.sensor.dark", &sensor.dark), ("data.sensor.white", &sensor.white)];
+        let frames = frames.into_iter().filter_map(|(key, path)| Some((key, path.as_deref()?)));
+        mask.into_iter().chain(calibration).chain(frames)
     }
 }
 
@@ -145,8 +150,21 @@ fn raw(t: &mut Table<'_>) -> Raw {
 }
 
 /// `[data.sensor]`.
-fn sensor(t: &mut Table<'_>) -> Sensor {
-    let noise = noise(t, "noise");
+fn sensor(t: &mut Table<'_>, simulated: bool) -> Sensor {
+    let noise = if t.word("noise", "auto") {
+        t.idle(&["photons"], "data.sensor.noise as a number: \"auto\" finds read noise");
+        t.show("noise", "auto");
+        SensorNoise::Auto
+    } else {
+        noise(t, "noise").map_or(SensorNoise::None, SensorNoise::Known)
+    };
+    if simulated {
+        t.idle(&["dark", "white"], "data.kind = \"scene\": a simulated sensor has data.sensor.black");
+    } else if t.holds("dark") {
+        t.idle(&["black"], "another black level than that of data.sensor.dark");
+    }
+    let frame = |t: &mut Table<'_>, key: &str| if t.holds(key) { Some(t.path(key)) } else { None };
+    let (dark, white) = (frame(t, "dark"), frame(t, "white"));
     let legal = "\"auto\", \"none\", or a number above 0 in the unit of the file";
     let clip = t.legal("clip", legal, |v| match (v.as_str(), as_number(v)) {
         (Some("auto"), _) => Some(Clip::Auto),
@@ -156,7 +174,7 @@ fn sensor(t: &mut Table<'_>) -> Sensor {
     });
     let clip = clip.unwrap_or_default();
     t.show("clip", clip.to_json());
-    Sensor { black: t.number("black", 0.0, -1e6..=1e6) as f32, noise, clip }
+    Sensor { black: t.number("black", 0.0, -1e6..=1e6) as f32, dark, white, noise, clip }
 }
 
 /// Read noise under this key, and shot noise.
@@ -225,6 +243,7 @@ impl MaskSource {
         let random = RandomMask {
             frames: t.whole("frames", 8, 2..=1024),
             density: t.number("density", 0.5, 1e-3..=1.0),
+            signed: t.flag("signed", false),
             seed: t.seed("seed", seed),
         };
         Ok(if kind == "random" { Self::Random(random) } else { Self::Shifting(random) })

@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::bands::Footprint;
+use crate::io::scene::SensorNoise;
 use crate::parts::{Chosen, Demosaicer, first_of_all};
 use crate::shipped;
 use crate::solvers::{self, Solver, Start};
@@ -360,13 +361,16 @@ impl Experiment {
 
     /// What needs the whole of a scene at once, if anything does: a key, and why.
     pub fn needs_whole(&self) -> Option<(&'static str, &'static str)> {
-        let data = &self.data;
+        let (data, sensor) = (&self.data, &self.data.reading.sensor);
         let reasons = [
             (
                 "data.kind",
                 data.simulate.is_some(),
                 "a simulated scene is made as a whole; `sci simulate` writes it to a file",
             ),
+            ("data.sensor.dark", sensor.dark.is_some(), "a dark frame is read as a whole"),
+            ("data.sensor.white", sensor.white.is_some(), "a white frame is read as a whole"),
+            ("data.sensor.noise", sensor.noise == SensorNoise::Auto, "noise is estimated from the whole"),
             ("data.mask_shift", data.reading.shift.is_some(), "a moving mask is moved as a whole"),
             ("data.raw", data.reading.raw.is_some(), "a file without a header is read as a whole"),
             ("data.calibration", data.calibration != Calibration::None, "masks are calibrated as a whole"),

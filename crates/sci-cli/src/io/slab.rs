@@ -210,7 +210,8 @@ fn runs(axes: &[(usize, Range<usize>)]) -> Vec<Range<usize>> {
     for (length, range) in &axes[..last.min(axes.len())] {
         starts = starts.iter().flat_map(|start| range.clone().map(move |i| start * length + i)).collect();
     }
-    let Some((length, range)) = axes.get(last) else { return vec![0..1] };
+    let whole = (1, 0..1);
+    let (length, range) = axes.get(last).unwrap_or(&whole);
     starts.iter().map(|start| (start * length + range.start) * inner..(start * length + range.end) * inner).collect()
 }
 

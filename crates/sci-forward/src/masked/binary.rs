@@ -7,7 +7,7 @@ use multiversion::multiversion;
 /// Bits of a word.
 const WORD: usize = u64::BITS as usize;
 
-/// Masks that are 0 or one value, stored as a bit a pixel: a 32nd of a [`MaskStack`].
+/// Masks that are 0 or one other value, stored as a bit a pixel: a 32nd of a [`MaskStack`].
 ///
 /// ```
 /// use ndarray::array;
@@ -25,7 +25,7 @@ pub struct BinaryMasks {
     shape: VideoShape,
     /// Row after row of frame after frame, each from a word of its own on, the first column in the lowest bit.
     words: Vec<u64>,
-    /// The transmittance of an open pixel.
+    /// The value of an open pixel.
     open: f32,
 }
 
@@ -36,13 +36,13 @@ impl BinaryMasks {
     /// [`MaskError::NotBinary`] with the first value that is neither 0 nor the first open one.
     pub fn new(masks: &MaskStack) -> Result<Self, MaskError> {
         let shape = masks.shape();
-        let open = masks.view().iter().copied().find(|&v| v > 0.0).ok_or(MaskError::AllClosed)?;
+        let open = masks.view().iter().copied().find(|&v| v != 0.0).ok_or(MaskError::AllClosed)?;
         if let Some(&value) = masks.view().iter().find(|&&v| v != 0.0 && v != open) {
             return Err(MaskError::NotBinary { value, open });
         }
         let view = masks.view();
         let rows = view.rows().into_iter().map(|row| row.to_vec());
-        let pack = |bits: &[f32]| bits.iter().rev().fold(0, |word, &v| word << 1 | u64::from(v > 0.0));
+        let pack = |bits: &[f32]| bits.iter().rev().fold(0, |word, &v| word << 1 | u64::from(v != 0.0));
         let words = rows.flat_map(|row| row.chunks(WORD).map(pack).collect::<Vec<_>>()).collect();
         Ok(Self { shape, words, open })
     }

@@ -28,10 +28,10 @@ pub struct Gained<S> {
 }
 
 impl<S: MaskSource> Gained<S> {
-    /// Takes a gain ≥ 0 for each frame of `source`.
+    /// Takes a gain for each frame of `source`; one below 0 turns the signs of its mask.
     ///
     /// # Errors
-    /// [`MaskError::Count`] if there is not one gain a frame, [`MaskError::Value`] if a transmittance is then out of range,
+    /// [`MaskError::Count`] if there is not one gain a frame, [`MaskError::Value`] if a value is then out of range,
     /// [`MaskError::AllClosed`] if none is left open.
     pub fn new(source: S, gain: Vec<f32>) -> Result<Self, MaskError> {
         let frames = source.shape().frames;

@@ -26,7 +26,7 @@ const BAND: usize = 16;
 /// [`MaskStack`] stores `f32`, [`BinaryMasks`] a bit a pixel, [`ShiftingMasks`] one pattern that moves, and [`Gained`] changes
 /// the frames of another source by a factor each. A spectral camera (CASSI) fits too: the bands are the frames, each as wide as the
 /// measurement, and band t's mask is the coded aperture moved by t columns and closed beside it; what is to be denoised is the
-/// video moved back. A source of one's own promises transmittances in 0 to 1e9, the same at every
+/// video moved back. A source of one's own promises values in -1e9 to 1e9, the same at every
 /// call; `testing::check_source` (feature `testing`) holds it to that.
 ///
 /// ```
@@ -53,7 +53,7 @@ pub trait MaskSource: Send + Sync {
     /// The size of the video that the masks modulate.
     fn shape(&self) -> VideoShape;
 
-    /// Writes the transmittances of `frame` in `row`, columns `start..start + out.len()`, to `out`.
+    /// Writes the masks' values of `frame` in `row`, columns `start..start + out.len()`, to `out`.
     ///
     /// # Panics
     /// If a position is outside [`MaskSource::shape`].

@@ -10,7 +10,7 @@ class VideoSCI(LinearPhysics):
     :math:`A A^\top` is diagonal, :math:`\sum_t C_t^2`, so that pseudo-inverse and proximal step have a closed form. It is made of torch
     operations: it runs on the device of its masks and can be differentiated through.
 
-    :param masks: tensor or array `[T, H, W]`, transmittances of at least 0.
+    :param masks: tensor or array `[T, H, W]`, transmittances, of a differential camera of both signs.
     :param channels: `"time"`, the default: videos are `[batch, T, H, W]`, as image denoisers with T channels and `sci` have them;
         `"video"`: `[batch, 1, T, H, W]`, as deepinv's video models have them. Measurements are `[batch, 1, H, W]`.
     :param kwargs: those of `deepinv.physics.LinearPhysics`, such as `noise_model` and `device`.

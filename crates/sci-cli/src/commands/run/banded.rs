@@ -83,7 +83,7 @@ impl Cut {
         factory: &mut Factory<'_>,
         folder: &RunFolder,
     ) -> anyhow::Result<bool> {
-        let (count, middle) = (self.bands.len(), self.bands.middle());
+        let (count, middle) = (self.bands.count(), self.bands.middle());
         let learning = experiment.online.is_some();
         let first = if learning { middle } else { 0 };
         for band in std::iter::once(first).chain((0..count).filter(|&band| band != first)) {
@@ -121,7 +121,7 @@ impl Cut {
 
     /// Makes a measurement of its bands.
     fn join(&self, k: usize, folder: &mut RunFolder) -> anyhow::Result<()> {
-        let bands: Option<Vec<Finished>> = (0..self.bands.len()).map(|band| folder.band(k, band)).collect();
+        let bands: Option<Vec<Finished>> = (0..self.bands.count()).map(|band| folder.band(k, band)).collect();
         let bands = bands.with_context(|| format!("a band of measurement {k} is gone from the folder"))?;
         let paths: Vec<PathBuf> = bands.iter().map(Finished::video).collect();
         folder.join_bands(k, &bands[self.bands.middle()], |path| {

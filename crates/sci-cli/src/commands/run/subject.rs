@@ -99,7 +99,7 @@ impl Subject {
     pub(super) fn in_bands(&self) -> String {
         match self {
             Self::Whole(_) => String::new(),
-            Self::Cut(cut) => format!(", in {} bands of rows", cut.bands.len()),
+            Self::Cut(cut) => format!(", in {} bands of rows", cut.bands.count()),
         }
     }
 

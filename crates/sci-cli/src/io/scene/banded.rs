@@ -217,6 +217,9 @@ impl Banded {
     ///
     /// # Errors
     /// As [`Banded::band`].
+    ///
+    /// # Panics
+    /// If there is no such measurement.
     pub fn y(&self, k: usize) -> Result<Array2<f32>, SceneError> {
         const ROWS: usize = 64;
         let height = self.shape.height;

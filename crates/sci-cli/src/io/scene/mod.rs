@@ -10,13 +10,14 @@ use std::sync::Arc;
 use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, Axis, s};
 use sci_forward::bayer::mosaic_into;
 use sci_forward::{
-    BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator,
+    BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator, brightness,
 };
 
 mod banded;
 #[cfg(test)]
 mod camera_tests;
 mod error;
+mod field;
 mod layout;
 mod names;
 mod read;
@@ -28,7 +29,7 @@ mod source;
 pub use banded::Banded;
 pub use error::SceneError;
 pub use read::{Arrays, Decided, Video, as_read, of_arrays, read, read_gray_video, read_mask, read_video};
-pub use sensor::{Clip, Sensor};
+pub use sensor::{Clip, Sensor, SensorNoise};
 pub use shift::MaskShift;
 
 use super::defects::Defects;
@@ -178,7 +179,7 @@ impl Scene {
                 (Some(x), Some(rgb))
             }
         };
-        let brightest = masks.sum().iter().copied().fold(0.0, f32::max);
+        let brightest = masks.reach();
         let operator = operator_of(masks);
         let mut warnings = Vec::new();
         let measurements = match (measurements, &truth) {
@@ -253,7 +254,7 @@ impl Scene {
     /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers; `brightest` is what white measures at
     /// most.
     fn look_for_wrong_scales(&mut self, brightest: f32) {
-        let peak = self.measurements.iter().copied().fold(0.0, f32::max);
+        let peak = self.measurements.iter().fold(0f32, |peak, y| peak.max(y.abs()));
         if peak > 2.0 * brightest {
             self.warnings.push(format!(
                 "measurements reach {peak}, but the masks add up to {brightest} at most; is data.scale right?"
@@ -335,6 +336,25 @@ fn simulate(
 
 /// White is here, in units of the file's scale; a scene may be darker than white, but a sensor's 8 bits end at the lower one.
 const PLAUSIBLE_WHITE: std::ops::RangeInclusive<f32> = 1.0 / 64.0..=4.0;
+
+/// What is white in measurements `[N, H, W]` of masks `[B, H, W]` if their brightest hundredth is; nothing if there is no light.
+fn brightest_light(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>) -> Option<f32> {
+    let open = masks.sum_axis(Axis(0));
+    // Masks of both signs may add up to nothing at a pixel.
+    let light = |y: ArrayView2<'_, f32>| match is_signed(masks) {
+        true => brightness(y, open.view(), EVEN),
+        false => &y / &open,
+    };
+    brightest_hundredth(meas.outer_iter().flat_map(light)).filter(|&bright| bright > 0.0)
+}
+
+/// Pixels to each side over which a scene is taken to be even, where a pixel alone says nothing.
+const EVEN: usize = 4;
+
+/// Whether masks are those of a differential camera.
+fn is_signed(masks: ArrayView3<'_, f32>) -> bool {
+    masks.iter().any(|&c| c < 0.0)
+}
 
 /// The value that a hundredth of the finite ones exceed.
 fn brightest_hundredth(values: impl Iterator<Item = f32>) -> Option<f32> {

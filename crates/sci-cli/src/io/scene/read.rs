@@ -2,15 +2,17 @@
 
 use std::path::Path;
 
-use ndarray::{Array3, Array4, ArrayView3, Axis};
-use sci_forward::MaskStack;
+use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
 use sci_forward::bayer::mosaic_into;
+use sci_forward::{MaskStack, Noise};
 
+use super::field::Field;
 use super::layout::Place;
 use super::scale::{self, Content};
 use super::source::Source;
 use super::{
-    Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, Truth, brightest_hundredth, names, operator_of,
+    Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, SensorNoise, Truth, brightest_hundredth,
+    brightest_light, check_size, is_signed, names, operator_of,
 };
 use crate::io::samples::Array;
 use crate::io::{NamedArrays, defects};
@@ -114,8 +116,9 @@ pub fn of_arrays(arrays: Arrays, reading: &Reading) -> Result<Scene, SceneError>
 
 pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) -> Result<Scene, SceneError> {
     let mut notes = std::mem::take(&mut parts.notes);
+    let mut field = Field::read(reading)?;
     let mut decided = reading.decided.unwrap_or_default();
-    let (mut mask, in_own_unit) = scene_masks(source, &mut parts, reading, &mut decided, &mut notes)?;
+    let (mut mask, in_own_unit) = scene_masks(source, &mut parts, reading, &field, &mut decided, &mut notes)?;
     let mut truth = truth(source, &parts, reading, &mut decided, &mut notes)?;
     if parts.meas.is_none() && truth.is_none() {
         return Err(source.missing(
@@ -130,18 +133,19 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
     let mut meas = stored.as_ref().map(|array| place.frames(array, 1.0)).transpose()?;
     let is_color = reading.cfa.is_some() || matches!(truth, Some(Truth::Rgb(_)));
     if let Some(shift) = reading.shift {
-        mask = moved_masks(source, mask, (shift, is_color), meas.as_mut(), truth.as_mut(), &mut notes)?;
+        let seen = [meas.as_mut(), field.dark.as_mut()];
+        mask = moved_masks(source, mask, (shift, is_color), seen, truth.as_mut(), &mut notes)?;
     } else if mask.len_of(Axis(0)) == 1 {
         notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
     }
+    let mut black = 0.0;
     if let (Some(meas), Some(array)) = (meas.as_mut(), &stored) {
-        let black = reading.sensor.black;
         if reading.decided.is_none() {
-            let (level, note) = reading.sensor.clip.level(meas.view(), mask.sum_axis(Axis(0)).view());
+            let (level, note) = reading.sensor.clip.level(meas.view(), light_through(mask.view()).view());
             notes.extend(note);
             decided.clip = level;
         }
-        *meas -= black;
+        black = take_off_black(meas, &field, (&source.file, key), reading)?;
         if reading.decided.is_none() {
             let seen = (array, meas.view());
             decided.meas = white_of_measurements(&place, seen, &mask, truth.as_ref(), reading, &mut notes);
@@ -157,9 +161,10 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
             look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
         }
     }
+    let noise = noise_of(&reading.sensor, mask.view(), meas.as_ref(), &mut notes);
     let mut scene = Scene::new(&source.file, &parts.keys, mask, meas, truth, reading.cfa)?;
-    let clip = decided.clip.map(|level| (level - reading.sensor.black) / (decided.meas * decided.unit));
-    (scene.unit, scene.clip, scene.noise, scene.decided) = (decided.unit, clip, reading.sensor.noise, decided);
+    let clip = decided.clip.map(|level| (level - black) / (decided.meas * decided.unit));
+    (scene.unit, scene.clip, scene.noise, scene.decided) = (decided.unit, clip, noise, decided);
     notes.append(&mut scene.warnings);
     scene.warnings = notes;
     Ok(scene)
@@ -170,11 +175,12 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
 /// # Errors
 /// If no pixel is left that is not defective.
 pub fn as_read(scene: &mut Scene, masks: MaskStack, reading: &Reading) -> Result<(), SceneError> {
-    let Sensor { black, noise, clip } = reading.sensor;
-    let (level, note) = clip.level(scene.measurements.view(), masks.sum().view());
+    let Sensor { black, clip, .. } = reading.sensor;
+    let (level, note) = clip.level(scene.measurements.view(), light_through(masks.view()).view());
     scene.warnings.extend(note);
     scene.measurements -= black;
-    (scene.noise, scene.clip) = (noise, level.map(|level| level - black));
+    scene.noise = noise_of(&reading.sensor, masks.view(), Some(&scene.measurements), &mut scene.warnings);
+    scene.clip = level.map(|level| level - black);
     let mut mask = masks.view().to_owned();
     look_for_defects(&mut mask, &mut scene.measurements, reading, scene.cfa.is_some(), &mut scene.warnings);
     if reading.defects == Defects::Exclude {
@@ -191,11 +197,12 @@ fn scene_masks(
     source: &Source,
     parts: &mut Parts,
     reading: &Reading,
+    field: &Field,
     decided: &mut Decided,
     notes: &mut Vec<String>,
 ) -> Result<(Array3<f32>, bool), SceneError> {
     if let Some(path) = &reading.mask {
-        return masks_of(&Source::open(path, None)?, reading, decided, notes);
+        return masks_of(&Source::open(path, None)?, reading, field, decided, notes);
     }
     let key = &parts.keys.mask;
     let Some(array) = parts.mask.take() else {
@@ -203,43 +210,26 @@ fn scene_masks(
         return Err(source.missing(key, "the masks; data.mask names a file of their own", names));
     };
     let place = Place { file: &source.file, key, format: source.format(), axes: reading.axes };
-    Ok(normalised(place.frames(&array, 1.0)?, key, reading.decided.is_some(), decided, notes))
+    transmittances(&place, &array, reading, field, decided, notes)
 }
 
 /// The masks that a file holds, under their name if it has names.
 fn masks_of(
     source: &Source,
     reading: &Reading,
+    field: &Field,
     decided: &mut Decided,
     notes: &mut Vec<String>,
 ) -> Result<(Array3<f32>, bool), SceneError> {
-    let (array, key) = if source.is_named() {
+    let mut wanted = reading.keys.mask.clone();
+    if source.is_named() {
         let own = Keys { mask: reading.keys.mask.clone(), ..Keys::default() };
-        let found = names::resolved(&own, &source.names()?).mask;
-        notes.extend(names::notes(&own, &Keys { mask: found.clone(), ..own.clone() }));
-        let NamedArrays { names, mut arrays } = source.arrays(&[found.as_str()])?;
-        // A file with one array says what it is by being there.
-        match (arrays.remove(&found), names.as_slice()) {
-            (Some(array), _) => (array, found),
-            (None, [only]) => {
-                let array = source.arrays(&[only.as_str()])?.arrays.remove(only);
-                (array.ok_or_else(|| source.missing(&found, "the masks", names.clone()))?, only.clone())
-            }
-            (None, _) => return Err(source.missing(&found, "the masks", names)),
-        }
-    } else {
-        (source.single()?, "mask".to_owned())
-    };
+        wanted = names::resolved(&own, &source.names()?).mask;
+        notes.extend(names::notes(&own, &Keys { mask: wanted.clone(), ..own.clone() }));
+    }
+    let (array, key) = source.array(&wanted, "the masks")?;
     let place = Place { file: &source.file, key: &key, format: source.format(), axes: reading.axes };
-    let white = match place.is_picture() && array.stored().is_integer() {
-        true => {
-            let white = scale::of_video(&key, &Content::of(&array, source.format()));
-            notes.extend(white.note);
-            white.value
-        }
-        false => 1.0,
-    };
-    let (masks, in_own_unit) = normalised(place.frames(&array, white)?, &key, false, decided, notes);
+    let (masks, in_own_unit) = transmittances(&place, &array, reading, field, decided, notes)?;
     let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
         file: source.file.clone(),
         key: key.clone(),
@@ -248,8 +238,30 @@ fn masks_of(
     Ok((checked.view().to_owned(), in_own_unit))
 }
 
-/// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that exceed 1 by far are in a unit of their own, in
-/// which the most open pixel is taken to be open. Small negative ones are what a dark frame leaves when it is taken off.
+/// Masks as transmittances, and whether they were in a unit of their own.
+fn transmittances(
+    place: &Place<'_>,
+    array: &Array,
+    reading: &Reading,
+    field: &Field,
+    decided: &mut Decided,
+    notes: &mut Vec<String>,
+) -> Result<(Array3<f32>, bool), SceneError> {
+    let full = match place.is_picture() && array.stored().is_integer() && field.white.is_none() {
+        true => {
+            let white = scale::of_video(place.key, &Content::of(array, place.format));
+            notes.extend(white.note);
+            white.value
+        }
+        false => 1.0,
+    };
+    let masks = field.transmittances(place.frames(array, 1.0)?, full, (place.key, reading), notes)?;
+    Ok(normalised(masks, place.key, reading.decided.is_some(), decided, notes))
+}
+
+/// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that
+/// exceed 1 by far are in a unit of their own, in which the most open pixel is taken to be open. Small negative ones are what a dark frame
+/// leaves when it is taken off, larger ones are of a differential camera.
 fn normalised(
     mut mask: Array3<f32>,
     key: &str,
@@ -257,10 +269,14 @@ fn normalised(
     decided: &mut Decided,
     notes: &mut Vec<String>,
 ) -> (Array3<f32>, bool) {
-    let most = mask.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
-    let most = if is_decided { decided.open } else { most };
-    let least = mask.iter().copied().fold(0.0, f32::min);
-    if least < 0.0 && least >= -SMALL * most {
+    let finite = || mask.iter().copied().filter(|v| v.is_finite());
+    let (least, highest) = (finite().fold(0.0, f32::min), finite().fold(0.0, f32::max));
+    let most = if is_decided { decided.open } else { highest.max(-least) };
+    if least < -SMALL * highest {
+        notes.push(format!(
+            "`{key}`: values down to {least} are taken for those of a differential camera; clipped, dead and hot pixels are not looked for"
+        ));
+    } else if least < 0.0 {
         let count = mask.iter().filter(|c| **c < 0.0).count();
         notes.push(format!("`{key}`: {count} transmittances below 0, down to {least}, count as 0"));
         // Not `max`: a NaN is to be refused.
@@ -270,7 +286,7 @@ fn normalised(
         return (mask, false);
     }
     let is_black_and_white =
-        scale::FULL_SCALES.iter().any(|&(_, full)| full == most) && mask.iter().all(|&v| v == 0.0 || v == most);
+        scale::FULL_SCALES.iter().any(|&(_, full)| full == most) && mask.iter().all(|&v| v == 0.0 || v.abs() == most);
     mask /= most;
     decided.open = most;
     (mask, !is_black_and_white)
@@ -358,7 +374,7 @@ fn moved_masks(
     source: &Source,
     mask: Array3<f32>,
     (shift, is_color): (super::MaskShift, bool),
-    meas: Option<&mut Array3<f32>>,
+    seen: [Option<&mut Array3<f32>>; 2],
     truth: Option<&mut Truth>,
     notes: &mut Vec<String>,
 ) -> Result<Array3<f32>, SceneError> {
@@ -368,7 +384,8 @@ fn moved_masks(
         return Err(SceneError::NotOneMask { file: source.file.clone(), found });
     }
     let moved = shift.masks(mask.index_axis_move(Axis(0), 0), is_color).map_err(error)?;
-    let mut is_cut = meas.is_some_and(|meas| moved.crop(meas));
+    let mut is_cut = false;
+    seen.into_iter().flatten().for_each(|seen| is_cut |= moved.crop(seen));
     match truth {
         Some(Truth::Sensor(x)) => is_cut |= moved.crop(x),
         Some(Truth::Rgb(x)) => is_cut |= moved.crop(x),
@@ -381,6 +398,69 @@ fn moved_masks(
     Ok(moved.masks)
 }
 
+/// What white measures `[H, W]`; of masks of both signs nothing, as their measurements do not tell how much light there was.
+fn light_through(masks: ArrayView3<'_, f32>) -> Array2<f32> {
+    match is_signed(masks) {
+        true => Array2::zeros((masks.len_of(Axis(1)), masks.len_of(Axis(2)))),
+        false => masks.sum_axis(Axis(0)),
+    }
+}
+
+/// The noise that solvers are told of: shot noise is that of the light, which measurements of masks of both signs do not tell.
+fn noise_of(
+    sensor: &Sensor,
+    masks: ArrayView3<'_, f32>,
+    meas: Option<&Array3<f32>>,
+    notes: &mut Vec<String>,
+) -> Option<Noise> {
+    let noise = match sensor.noise {
+        SensorNoise::None => return None,
+        SensorNoise::Known(noise) => noise,
+        SensorNoise::Auto => return found_noise(masks, meas?.view(), notes),
+    };
+    if noise == noise.read_noise() || !is_signed(masks) {
+        return Some(noise);
+    }
+    notes.push("data.sensor.photons is left out: masks of both signs do not tell the light of a pixel; data.sensor.noise is used".into());
+    Some(noise.read_noise())
+}
+
+/// What is found of the noise, and said.
+fn found_noise(masks: ArrayView3<'_, f32>, meas: ArrayView3<'_, f32>, notes: &mut Vec<String>) -> Option<Noise> {
+    let open = masks.mapv(f32::abs).sum_axis(Axis(0));
+    let found = if meas.shape()[1..] == *open.shape() { Noise::of_closed_pixels(meas, open.view()) } else { None };
+    notes.push(match found {
+        Some(noise) => format!(
+            "data.sensor.noise = \"auto\": read noise of {:.2} (of 255), from pixels that no mask opens",
+            255.0 * noise.variance(0.0).sqrt()
+        ),
+        None => {
+            "data.sensor.noise = \"auto\": too few pixels are never opened by a mask to tell the noise; none is assumed"
+                .into()
+        }
+    });
+    found.filter(|noise| *noise != Noise::NONE)
+}
+
+/// Takes the dark frame, or the black level, off measurements; returns what that is of a clipped pixel at most.
+fn take_off_black(
+    meas: &mut Array3<f32>,
+    field: &Field,
+    (file, key): (&str, &str),
+    reading: &Reading,
+) -> Result<f32, SceneError> {
+    let Some(dark) = &field.dark else {
+        *meas -= reading.sensor.black;
+        return Ok(reading.sensor.black);
+    };
+    let size = (meas.len_of(Axis(1)), meas.len_of(Axis(2)));
+    let dark_file = reading.sensor.dark.as_ref().map_or_else(|| file.to_owned(), |path| path.display().to_string());
+    check_size(&dark_file, "data.sensor.dark", dark.view(), key, size)?;
+    *meas -= dark;
+    // The few pixels that are darkest by chance, or hot, do not lower the level for all others.
+    Ok(brightest_hundredth(dark.iter().copied()).unwrap_or(0.0))
+}
+
 /// Names pixels that look defective, and leaves them out if that is asked for.
 fn look_for_defects(
     mask: &mut Array3<f32>,
@@ -389,7 +469,7 @@ fn look_for_defects(
     is_color: bool,
     notes: &mut Vec<String>,
 ) {
-    let found = defects::find(mask.sum_axis(Axis(0)).view(), meas.view(), if is_color { 2 } else { 1 });
+    let found = defects::find(light_through(mask.view()).view(), meas.view(), if is_color { 2 } else { 1 });
     if let Some(named) = defects::named(&found) {
         notes.push(match reading.defects {
             Defects::Exclude => format!("pixels left out as not measured: {named}"),
@@ -409,11 +489,9 @@ fn rescale(
     truth: Option<&mut Truth>,
     warnings: &mut Vec<String>,
 ) -> f32 {
-    let open = mask.sum_axis(Axis(0));
-    let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
-    let Some(white) = brightest_hundredth(light) else { return 1.0 };
+    let Some(white) = brightest_light(meas.view(), mask.view()) else { return 1.0 };
     let unknown = in_own_unit && truth.is_none();
-    if white <= 0.0 || (PLAUSIBLE_WHITE.contains(&white) && !unknown) {
+    if PLAUSIBLE_WHITE.contains(&white) && !unknown {
         return 1.0;
     }
     *meas /= white;
@@ -501,7 +579,7 @@ fn luma(video: Array4<f32>) -> Array4<f32> {
 pub fn read_mask(path: &Path, reading: &Reading) -> Result<(MaskStack, Vec<String>), SceneError> {
     let source = Source::open(path, None)?;
     let mut notes = Vec::new();
-    let (masks, _) = masks_of(&source, reading, &mut Decided::default(), &mut notes)?;
+    let (masks, _) = masks_of(&source, reading, &Field::default(), &mut Decided::default(), &mut notes)?;
     let masks = MaskStack::new(masks).map_err(|e| SceneError::Mask {
         file: source.file,
         key: reading.keys.mask.clone(),

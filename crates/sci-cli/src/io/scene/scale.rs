@@ -40,6 +40,7 @@ impl White {
 
 /// What the numbers of an array look like.
 pub(super) struct Content {
+    /// The largest, without its sign.
     max: f32,
     /// Whether all are whole.
     whole: bool,
@@ -56,7 +57,7 @@ impl Content {
         for i in 0..array.samples().len() {
             let v = array.samples().at(i);
             if v.is_finite() {
-                max = max.max(v);
+                max = max.max(v.abs());
                 whole &= v.fract() == 0.0;
                 ones |= v.abs() as u32;
             }
@@ -148,14 +149,12 @@ pub(super) fn of_measurements(
             White::noted(key, white, "the truth tells the scale of the measurements".into())
         };
     }
-    let open = masks.sum_axis(Axis(0));
-    let light = meas.outer_iter().flat_map(|y| ndarray::Zip::from(y).and(&open).map_collect(|&y, &open| y / open));
-    let Some(bright) = super::brightest_hundredth(light).filter(|&b| b > 0.0) else { return White::plain(usual) };
+    let Some(bright) = super::brightest_light(meas, masks) else { return White::plain(usual) };
     if content.is_deep() {
         return of_deep_measurements(key, content, bright);
     }
     // Masks in a unit of their own make measurements so too, of which nothing is known.
-    let transmittances = masks.iter().all(|&c| c <= 1.0);
+    let transmittances = masks.iter().all(|&c| c.abs() <= 1.0);
     if content.stored.is_integer() || super::PLAUSIBLE_WHITE.contains(&(bright / usual)) || !transmittances {
         return White::plain(usual);
     }

@@ -1,17 +1,35 @@
 //! What a sensor does to the light that it sums.
 
+use std::path::PathBuf;
+
 use ndarray::{ArrayView2, ArrayView3, Zip};
 use sci_forward::Noise;
 
 /// What is known of a sensor, or to be found out.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sensor {
     /// What it measures without light, in the unit of the file.
     pub black: f32,
-    /// Its noise, in units of white; `None` for measurements that are to be explained exactly.
-    pub noise: Option<Noise>,
+    /// The same pixel by pixel, a file or folder.
+    pub dark: Option<PathBuf>,
+    /// What it measures of a white scene with no mask before it, a file or folder.
+    pub white: Option<PathBuf>,
+    /// Its noise.
+    pub noise: SensorNoise,
     /// Whether its brightest pixels are clipped.
     pub clip: Clip,
+}
+
+/// What solvers are told of a sensor's noise.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum SensorNoise {
+    /// Nothing: measurements are to be explained exactly.
+    #[default]
+    None,
+    /// This, in units of white.
+    Known(Noise),
+    /// What pixels that no mask opens show of it.
+    Auto,
 }
 
 /// The level that a sensor cannot exceed.
@@ -66,7 +84,7 @@ impl Clip {
 fn crowded(meas: ArrayView3<'_, f32>, open: ArrayView2<'_, f32>) -> Option<(f32, f64)> {
     let brightest = meas.iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
     let most_open = open.iter().copied().fold(0.0, f32::max);
-    if brightest <= 0.0 || meas.shape()[1..] != *open.shape() {
+    if brightest <= 0.0 || most_open <= 0.0 || meas.shape()[1..] != *open.shape() {
         return None;
     }
     let (mut count, mut openness) = (0usize, 0f64);

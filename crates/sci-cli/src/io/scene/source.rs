@@ -122,6 +122,22 @@ impl Source {
         }
     }
 
+    /// The array of this name, or the only one: a file with one array says what it is by being there. With its name.
+    pub(super) fn array(&self, wanted: &str, part: &'static str) -> Result<(Array, String), SceneError> {
+        if !self.is_named() {
+            return Ok((self.single()?, wanted.to_owned()));
+        }
+        let names = self.names()?;
+        let name = match names.as_slice() {
+            [only] => only.as_str(),
+            _ => wanted,
+        };
+        match self.arrays(&[name])?.arrays.remove(name) {
+            Some(array) => Ok((array, name.to_owned())),
+            None => Err(self.missing(wanted, part, names)),
+        }
+    }
+
     /// As [`Source::single`], and clips too.
     pub(super) fn video(&self) -> Result<Array, SceneError> {
         match self.content {
