@@ -58,7 +58,7 @@ impl Args {
         let begin = Instant::now();
         let shard = self.shard()?;
         let experiment = config::load(&self.config, &self.set)?;
-        let out = self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name));
+        let out = self.out(&experiment);
         check_folder(&out)?;
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
@@ -114,6 +114,10 @@ impl Args {
         done
     }
 
+    fn out(&self, experiment: &Experiment) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name))
+    }
+
     /// The shard that is asked for, or that this is as a task of a job array; nothing for the whole run.
     fn shard(&self) -> Result<Option<Shard>, UsageError> {
         if let Some(shard) = self.shard {
@@ -165,10 +169,9 @@ impl Args {
 
     /// What to call for another shard of this run.
     fn command(&self, experiment: &Experiment) -> run_folder::Command {
-        let out = self.out.clone().unwrap_or_else(|| Path::new("runs").join(&experiment.name));
         let mut words = vec!["sci".to_owned(), "run".to_owned(), self.config.display().to_string()];
         self.set.iter().for_each(|set| words.extend(["--set".to_owned(), set.clone()]));
-        words.extend(["--out".to_owned(), out.display().to_string()]);
+        words.extend(["--out".to_owned(), self.out(experiment).display().to_string()]);
         run_folder::Command { folder: std::env::current_dir().unwrap_or_default().display().to_string(), words }
     }
 
