@@ -15,7 +15,8 @@ const BUNDLED: &[(&str, &[u8])] = bundled![
     "ddnet",
     "fastdvdnet_color",
     "fastdvdnet_color_sci",
-    "shiftnet_gray_sci"
+    "shiftnet_gray_sci",
+    "shiftnet_color_sci"
 ];
 
 /// The names that `bundled:NAME` knows.
