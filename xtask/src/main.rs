@@ -4,6 +4,7 @@
 
 mod bench;
 mod circles;
+mod large;
 mod pareto;
 mod plot;
 mod repro;
@@ -45,6 +46,8 @@ enum Bench {
     Sensitivity(sensitivity::Options),
     /// The faults of real cameras, one at a time and together, with and without calibration
     Robust(robust::Options),
+    /// Scenes larger than memory: seconds and memory over size
+    Large(large::Options),
 }
 
 fn main() -> anyhow::Result<()> {
@@ -59,5 +62,6 @@ fn main() -> anyhow::Result<()> {
         Task::Bench(Bench::Pareto(options)) => pareto::run(&options),
         Task::Bench(Bench::Sensitivity(options)) => sensitivity::run(&options),
         Task::Bench(Bench::Robust(options)) => robust::run(&options),
+        Task::Bench(Bench::Large(options)) => large::run(&options),
     }
 }
