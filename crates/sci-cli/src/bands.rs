@@ -191,17 +191,18 @@ impl<'b> Joined<'b> {
     pub fn write(
         mut self,
         path: &Path,
-        mut look: impl FnMut(usize, &Array3<f32>) -> anyhow::Result<()>,
+        mut look: impl FnMut(usize, Array3<f32>) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
         let fail = |e: io::Error| WriteError::new(path, e);
         let mut file = BufWriter::new(File::create(path).map_err(fail)?);
         file.write_all(&npy::header(&self.shape)).map_err(fail)?;
         for t in 0..self.shape[0] {
             let frame = self.next_frame().map_err(fail)?;
-            for value in &frame {
-                file.write_all(&value.to_le_bytes()).map_err(fail)?;
+            for row in frame.rows() {
+                let bytes: Vec<u8> = row.iter().flat_map(|value| value.to_le_bytes()).collect();
+                file.write_all(&bytes).map_err(fail)?;
             }
-            look(t, &frame)?;
+            look(t, frame)?;
         }
         Ok(file.flush().map_err(fail)?)
     }
@@ -275,7 +276,7 @@ mod tests {
         Joined::open(&bands, &paths, shape)
             .unwrap()
             .write(&path, |t, frame| {
-                let off = (frame - &video.slice(s![t, .., .., ..])).iter().fold(0f32, |most, d| most.max(d.abs()));
+                let off = (&frame - &video.slice(s![t, .., .., ..])).iter().fold(0f32, |most, d| most.max(d.abs()));
                 assert!(off < 1e-6, "{off}");
                 seen += 1;
                 Ok(())

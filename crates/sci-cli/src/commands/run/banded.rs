@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use ndarray::{Array3, Array4, Axis};
+use rayon::prelude::*;
 use sci_forward::bayer::mosaic_into;
 
 use super::super::interrupted;
@@ -23,6 +24,8 @@ use crate::solve;
 pub(super) struct Cut {
     pub(super) scene: Banded,
     pub(super) bands: Bands,
+    /// Bytes that may be taken.
+    pub(super) memory: usize,
 }
 
 impl Cut {
@@ -125,13 +128,27 @@ impl Cut {
         let bands = bands.with_context(|| format!("a band of measurement {k} is gone from the folder"))?;
         let paths: Vec<PathBuf> = bands.iter().map(Finished::video).collect();
         folder.join_bands(k, &bands[self.bands.middle()], |path| {
-            let mut of_frames = Vec::new();
-            Joined::open(&self.bands, &paths, self.shape())?.write(path, |t, frame| {
-                of_frames.extend(self.compared(k, t, frame)?);
+            let (mut of_frames, mut waiting) = (Vec::new(), Vec::new());
+            let mut compare = |frames: &mut Vec<(usize, Array3<f32>)>| {
+                let compared = frames.par_drain(..).map(|(t, frame)| self.compared(k, t, &frame));
+                let compared: Vec<Option<MeasurementRecord>> = compared.collect::<anyhow::Result<_>>()?;
+                of_frames.extend(compared.into_iter().flatten());
                 Ok(())
+            };
+            Joined::open(&self.bands, &paths, self.shape())?.write(path, |t, frame| {
+                waiting.push((t, frame));
+                if waiting.len() < self.frames_at_once() { Ok(()) } else { compare(&mut waiting) }
             })?;
+            compare(&mut waiting)?;
             Ok(self.joined_record(&bands, &of_frames))
         })
+    }
+
+    /// How many frames are compared with the truth at once: each is there with its truth, and with what the metrics make of them.
+    fn frames_at_once(&self) -> usize {
+        let [_, channels, height, width] = self.shape();
+        let frame = 4 * height * width * (3 * channels + 4);
+        (self.memory / 2 / frame).clamp(1, rayon::current_num_threads())
     }
 
     /// How near frame `t` is to the truth, if that is known: PSNR, both SSIMs, and PSNR in color.

@@ -76,7 +76,7 @@ impl Subject {
             return Ok(None);
         }
         let scene = Banded::open(path, reading, bands.solved(bands.middle()).len()).context("data.path")?;
-        Ok(Some(Cut { scene, bands }))
+        Ok(Some(Cut { scene, bands, memory }))
     }
 
     /// The pattern of a color sensor.

@@ -223,6 +223,13 @@ impl Banded {
     pub fn y(&self, k: usize) -> Result<Array2<f32>, SceneError> {
         const ROWS: usize = 64;
         let height = self.shape.height;
+        if let Some(part) = &self.meas {
+            let place = Place { file: &self.file, key: &part.key, format: part.format, axes: self.reading.axes };
+            let decided = self.reading.decided.unwrap_or_default();
+            let stored = place.frames(&part.read(k..k + 1, 0..height)?, 1.0)?;
+            let black = self.reading.sensor.black;
+            return Ok(stored.index_axis_move(Axis(0), 0).mapv(|y| (y - black) / decided.meas / decided.unit));
+        }
         let rows = |first: usize| first..(first + ROWS).min(height);
         let strips = (0..height).step_by(ROWS).map(|first| Ok(self.band(k, rows(first))?.y(0).to_owned()));
         let strips = strips.collect::<Result<Vec<Array2<f32>>, SceneError>>()?;
