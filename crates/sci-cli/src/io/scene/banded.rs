@@ -131,6 +131,10 @@ impl Banded {
         let is_color = rgb.is_some() || reading.cfa.is_some();
         let truth = if rgb.is_some() { rgb } else { part_of(&named, &keys.orig, format)? };
         let frames = mask.frames();
+        if frames == 0 || mask.size().0 == 0 || mask.size().1 == 0 {
+            let why = format!("`{}` has shape {:?}: nothing is in it", mask.key, mask.stored.shape());
+            return Err(SceneError::NotInBands { file, why });
+        }
         let count = match (&meas, &truth) {
             (Some(meas), _) => meas.frames(),
             (None, Some(truth)) => truth.frames() / frames,
@@ -249,6 +253,49 @@ impl Truth {
                 mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
                 (x, Some(rgb))
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray_npy::NpzWriter;
+
+    /// A scene of bytes whose masks have this shape, and the folder that it is in.
+    fn scene(masks: [usize; 3], frames: usize) -> (tempfile::TempDir, std::path::PathBuf) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
+        npz.add_array("mask", &Array3::<u8>::ones(masks)).unwrap();
+        let video = Array3::from_shape_fn((frames, masks[1], masks[2]), |(t, y, x)| (t + 5 * y + x) as u8);
+        npz.add_array("orig", &video).unwrap();
+        npz.finish().unwrap();
+        (dir, path)
+    }
+
+    #[test]
+    fn bands_hold_what_the_whole_has_in_their_rows() {
+        let (_dir, path) = scene([2, 40, 6], 5);
+        let banded = Banded::open(&path, &Reading::default(), 20).unwrap();
+        let whole = super::super::read(&path, &Reading::default()).unwrap();
+        assert_eq!((banded.len(), banded.shape(), banded.unit), (2, whole.operator.shape(), 1.0));
+        let band = banded.band(1, 10..30).unwrap();
+        assert_eq!(band.y(0), whole.y(1).slice(ndarray::s![10..30, ..]));
+        assert_eq!(band.truth_of(0).unwrap(), whole.truth_of(1).unwrap().slice(ndarray::s![.., 10..30, ..]));
+        assert_eq!(banded.y(1).unwrap(), whole.y(1));
+        let (frame, color) = banded.truth_frame(1, 1).unwrap().unwrap().seen(None);
+        assert_eq!((frame.index_axis(Axis(0), 0), color), (whole.truth_of(1).unwrap().index_axis(Axis(0), 1), None));
+    }
+
+    #[test]
+    fn empty_and_short_arrays_are_errors() {
+        for (masks, frames, said) in
+            [([0, 4, 4], 3, "nothing is in it"), ([2, 0, 4], 3, "nothing"), ([4, 4, 4], 3, "3")]
+        {
+            let (_dir, path) = scene(masks, frames);
+            let error = Banded::outline(&path, &Reading::default()).unwrap_err().to_string();
+            assert!(error.contains(said) && error.contains("scene.npz"), "{error}");
         }
     }
 }
