@@ -114,7 +114,7 @@ impl Studio<'_> {
         shape: [usize; 4],
     ) -> anyhow::Result<()> {
         let (index, path) = (finished.record.index, finished.video());
-        if !(output.frames || output.preview || output.report) {
+        if !output.has_pictures() {
             return Ok(());
         }
         finished.make_pictures(|dir| {

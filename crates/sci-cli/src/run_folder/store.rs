@@ -8,7 +8,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use admm::Estimate;
-use ndarray::{Array3, Array4, ArrayBase, Data, Dimension};
+use ndarray::{Array3, Array4, ArrayBase, ArrayView4, Data, Dimension};
 use ndarray_npy::ReadNpyExt;
 use serde::{Deserialize, Serialize};
 
@@ -142,15 +142,9 @@ impl RunFolder {
         state: impl FnOnce(&Path) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
         let dir = self.staging.join(measurement_name(record.index));
-        let temporary = dir.with_extension("tmp");
         let dir = if whole { dir } else { dir.with_extension("stopped") };
-        fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
-        let mut checksums = vec![write_array(&temporary.join(VIDEO), &estimate.video())?];
-        if keep_sensor {
-            checksums.push(write_array(&temporary.join(SENSOR), &estimate.sensor)?);
-        }
-        state(&temporary.join(WEIGHTS))?;
-        self.finished.push(completed(&temporary, &dir, Entry { record, checksums })?);
+        let sensor = keep_sensor.then_some(&estimate.sensor);
+        self.finished.push(put(&dir, record, &estimate.video(), sensor, state)?);
         Ok(())
     }
 
@@ -173,16 +167,8 @@ impl RunFolder {
         state: impl FnOnce(&Path) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
         let dir = self.bands(record.index).join(format!("b{band:03}"));
-        let temporary = dir.with_extension("tmp");
-        remove(&temporary).map_err(fail(&temporary))?;
-        fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
-        let mut checksums = vec![write_array(&temporary.join(VIDEO), video)?];
-        if let Some(sensor) = sensor {
-            checksums.push(write_array(&temporary.join(SENSOR), sensor)?);
-        }
-        state(&temporary.join(WEIGHTS))?;
         remove(&dir).map_err(fail(&dir))?;
-        completed(&temporary, &dir, Entry { record, checksums })?;
+        put(&dir, record, &video.view(), sensor, state)?;
         Ok(())
     }
 
@@ -218,6 +204,25 @@ impl RunFolder {
     fn bands(&self, index: usize) -> PathBuf {
         self.staging.join(measurement_name(index)).with_extension(BANDS)
     }
+}
+
+/// Writes what is solved beside its folder, and makes it the folder.
+fn put(
+    dir: &Path,
+    record: MeasurementRecord,
+    video: &ArrayView4<'_, f32>,
+    sensor: Option<&Array3<f32>>,
+    state: impl FnOnce(&Path) -> anyhow::Result<()>,
+) -> anyhow::Result<Finished> {
+    let temporary = dir.with_extension("tmp");
+    remove(&temporary).map_err(fail(&temporary))?;
+    fs::create_dir_all(temporary.join(WEIGHTS)).map_err(fail(&temporary))?;
+    let mut checksums = vec![write_array(&temporary.join(VIDEO), video)?];
+    if let Some(sensor) = sensor {
+        checksums.push(write_array(&temporary.join(SENSOR), sensor)?);
+    }
+    state(&temporary.join(WEIGHTS))?;
+    Ok(completed(&temporary, dir, Entry { record, checksums })?)
 }
 
 /// Makes a folder of arrays what it is to be, in one step.

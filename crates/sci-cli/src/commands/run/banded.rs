@@ -130,7 +130,7 @@ impl Cut {
         folder.join_bands(k, &bands[self.bands.middle()], |path| {
             let (mut of_frames, mut waiting) = (Vec::new(), Vec::new());
             let mut compare = |frames: &mut Vec<(usize, Array3<f32>)>| {
-                let compared = frames.par_drain(..).map(|(t, frame)| self.compared(k, t, &frame));
+                let compared = frames.par_drain(..).map(|(t, frame)| self.compared(k, t, frame));
                 let compared: Vec<Option<MeasurementRecord>> = compared.collect::<anyhow::Result<_>>()?;
                 of_frames.extend(compared.into_iter().flatten());
                 Ok(())
@@ -152,10 +152,10 @@ impl Cut {
     }
 
     /// How near frame `t` is to the truth, if that is known: PSNR, both SSIMs, and PSNR in color.
-    fn compared(&self, k: usize, t: usize, frame: &Array3<f32>) -> anyhow::Result<Option<MeasurementRecord>> {
+    fn compared(&self, k: usize, t: usize, frame: Array3<f32>) -> anyhow::Result<Option<MeasurementRecord>> {
         let Some(truth) = self.scene.truth_frame(k, t)? else { return Ok(None) };
         let (truth, truth_rgb) = truth.seen(self.scene.cfa);
-        let video: Array4<f32> = frame.to_owned().insert_axis(Axis(0));
+        let video: Array4<f32> = frame.insert_axis(Axis(0));
         let sensor = match self.scene.cfa {
             None => video.index_axis(Axis(1), 0).to_owned(),
             Some(cfa) => {

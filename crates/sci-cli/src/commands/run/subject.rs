@@ -9,7 +9,6 @@ use super::read_scene;
 use crate::bands::Bands;
 use crate::config::Experiment;
 use crate::io::scene::{Banded, Scene, SceneError};
-use crate::io::slab;
 use crate::solve;
 
 /// What a run solves.
@@ -59,14 +58,9 @@ impl Subject {
     fn cut(experiment: &Experiment) -> anyhow::Result<Option<Cut>> {
         let (path, reading) = (&experiment.data.path, &experiment.data.reading);
         let Some(memory) = experiment.memory.filter(|_| experiment.needs_whole().is_none()) else { return Ok(None) };
-        let files = std::iter::once(path).chain(&reading.mask);
-        for file in files {
-            if slab::arrays(file).map_err(SceneError::from).context("data.path")?.is_none() {
-                return Ok(None);
-            }
-        }
-        let (shape, is_color) = Banded::outline(path, reading).context("data.path")?;
-        let bands = Bands::new(shape, experiment.footprint(is_color), memory).map_err(|needed| {
+        let Some(mut scene) = Banded::open(path, reading).context("data.path")? else { return Ok(None) };
+        let shape = scene.shape();
+        let bands = Bands::new(shape, experiment.footprint(scene.cfa.is_some()), memory).map_err(|needed| {
             let (memory, needed) = (megabytes(memory), megabytes(needed));
             UsageError(format!(
                 "`memory` is {memory} MB, but the lowest band of {shape} takes {needed} MB; legal: that or more"
@@ -75,7 +69,7 @@ impl Subject {
         if bands.is_whole() {
             return Ok(None);
         }
-        let scene = Banded::open(path, reading, bands.solved(bands.middle()).len()).context("data.path")?;
+        scene.decide(bands.solved(bands.middle()).len()).context("data.path")?;
         Ok(Some(Cut { scene, bands, memory }))
     }
 

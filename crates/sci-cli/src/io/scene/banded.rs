@@ -3,8 +3,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use ndarray::{Array2, Array3, Array4, Axis, concatenate};
-use sci_forward::bayer::mosaic_into;
+use ndarray::{Array2, Axis, concatenate};
 use sci_forward::{CfaPattern, VideoShape};
 
 use super::layout::{FileAxes, Place};
@@ -66,41 +65,13 @@ impl Part {
 }
 
 impl Banded {
-    /// Looks at a scene, of which `rows` rows can be in memory at once.
+    /// Looks at a scene; nothing of one whose format has to be read whole. [`Banded::decide`] comes next.
     ///
     /// # Errors
-    /// [`SceneError`] naming the file and what is wrong with it: among others that it has to be read whole.
-    pub fn open(path: &Path, reading: &Reading, rows: usize) -> Result<Self, SceneError> {
-        let mut scene = Self::found(path, reading)?;
-        let (height, rows) = (scene.shape.height, rows.min(scene.shape.height).max(2));
-        let first = (height - rows) / 2 / 2 * 2;
-        let part = scene.band(0, first..first + rows)?;
-        if part.unit != 1.0 && scene.truth.is_some() {
-            let why = "neither measurements nor truth are on a usual scale; say in data.scale what white is".into();
-            return Err(SceneError::NotInBands { file: scene.file, why });
-        }
-        scene.reading.decided = Some(part.decided);
-        (scene.unit, scene.cfa) = (part.unit, part.cfa);
-        scene.warnings.extend(part.warnings);
-        Ok(scene)
-    }
-
-    /// The size of the frames of a scene that can be read in bands, and whether it is in color; nothing of one that cannot.
-    ///
-    /// # Errors
-    /// As [`Banded::open`].
-    pub fn outline(path: &Path, reading: &Reading) -> Result<(VideoShape, bool), SceneError> {
-        let scene = Self::found(path, reading)?;
-        Ok((scene.shape, scene.cfa.is_some()))
-    }
-
-    fn found(path: &Path, reading: &Reading) -> Result<Self, SceneError> {
+    /// [`SceneError`] naming the file and what is wrong with it.
+    pub fn open(path: &Path, reading: &Reading) -> Result<Option<Self>, SceneError> {
         let file = path.display().to_string();
-        let whole = |file: &Path| SceneError::NotInBands {
-            file: file.display().to_string(),
-            why: "of files, .npz, .npy, .h5 and .mat of version 7.3 can be; `sci simulate` and numpy write such".into(),
-        };
-        let slab::Arrays { named, format } = slab::arrays(path)?.ok_or_else(|| whole(path))?;
+        let Some(slab::Arrays { named, format }) = slab::arrays(path)? else { return Ok(None) };
         let listed: Vec<String> = named.iter().map(|(name, _)| name.clone()).collect();
         let keys = names::resolved(&reading.keys, &listed);
         let part_of = |named: &[(String, Stored)], key: &str, format: Format| {
@@ -114,7 +85,7 @@ impl Banded {
         let mask = match &reading.mask {
             None => part_of(&named, &keys.mask, format)?,
             Some(path) => {
-                let own = slab::arrays(path)?.ok_or_else(|| whole(path))?;
+                let Some(own) = slab::arrays(path)? else { return Ok(None) };
                 let listed: Vec<String> = own.named.iter().map(|(name, _)| name.clone()).collect();
                 let found = names::resolved(&Keys { mask: reading.keys.mask.clone(), ..Keys::default() }, &listed);
                 let key = if own.named.len() == 1 { listed[0].clone() } else { found.mask };
@@ -155,7 +126,25 @@ impl Banded {
         let reading = Reading { keys, mask: None, ..reading.clone() };
         let cfa = is_color.then(|| reading.cfa.unwrap_or_default());
         let shape = VideoShape { frames, height, width };
-        Ok(Self { file, reading, mask, meas, truth, shape, count, cfa, unit: 1.0, warnings })
+        Ok(Some(Self { file, reading, mask, meas, truth, shape, count, cfa, unit: 1.0, warnings }))
+    }
+
+    /// Decides by `rows` rows in the middle of the first measurement what the numbers mean.
+    ///
+    /// # Errors
+    /// Those of reading them, and if they tell a white that does not go with the truth.
+    pub fn decide(&mut self, rows: usize) -> Result<(), SceneError> {
+        let (height, rows) = (self.shape.height, rows.min(self.shape.height).max(2));
+        let first = (height - rows) / 2 / 2 * 2;
+        let part = self.band(0, first..first + rows)?;
+        if part.unit != 1.0 && self.truth.is_some() {
+            let why = "neither measurements nor truth are on a usual scale; say in data.scale what white is".into();
+            return Err(SceneError::NotInBands { file: self.file.clone(), why });
+        }
+        self.reading.decided = Some(part.decided);
+        (self.unit, self.cfa) = (part.unit, part.cfa);
+        self.warnings.extend(part.warnings);
+        Ok(())
     }
 
     /// B frames of the size of the sensor.
@@ -197,6 +186,10 @@ impl Banded {
         assembled(&source, Parts { keys, names: Vec::new(), mask, meas, orig, rgb, notes: Vec::new() }, &self.reading)
     }
 
+    fn place<'p>(&'p self, part: &'p Part) -> Place<'p> {
+        Place { file: &self.file, key: &part.key, format: part.format, axes: self.reading.axes }
+    }
+
     fn has_rgb(&self) -> bool {
         self.truth.as_ref().is_some_and(|truth| truth.key == self.reading.keys.rgb)
     }
@@ -208,7 +201,7 @@ impl Banded {
     pub fn truth_frame(&self, k: usize, t: usize) -> Result<Option<Truth>, SceneError> {
         let Some((part, frames)) = self.frames_of(k) else { return Ok(None) };
         let array = part.read(frames.start + t..frames.start + t + 1, 0..self.shape.height)?;
-        let place = Place { file: &self.file, key: &part.key, format: part.format, axes: self.reading.axes };
+        let place = self.place(part);
         let white = self.reading.decided.unwrap_or_default().truth;
         Ok(Some(if self.has_rgb() {
             Truth::Rgb(place.channels(&array, white)?)
@@ -228,9 +221,8 @@ impl Banded {
         const ROWS: usize = 64;
         let height = self.shape.height;
         if let Some(part) = &self.meas {
-            let place = Place { file: &self.file, key: &part.key, format: part.format, axes: self.reading.axes };
             let decided = self.reading.decided.unwrap_or_default();
-            let stored = place.frames(&part.read(k..k + 1, 0..height)?, 1.0)?;
+            let stored = self.place(part).frames(&part.read(k..k + 1, 0..height)?, 1.0)?;
             let black = self.reading.sensor.black;
             return Ok(stored.index_axis_move(Axis(0), 0).mapv(|y| (y - black) / decided.meas / decided.unit));
         }
@@ -242,24 +234,10 @@ impl Banded {
     }
 }
 
-impl Truth {
-    /// What a sensor with this pattern sees of it, `[T, H, W]`, and the color video if it is one.
-    pub fn seen(self, cfa: Option<CfaPattern>) -> (Array3<f32>, Option<Array4<f32>>) {
-        match self {
-            Self::Sensor(x) => (x, None),
-            Self::Rgb(rgb) => {
-                let (t, _, h, w) = rgb.dim();
-                let mut x = Array3::zeros((t, h, w));
-                mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
-                (x, Some(rgb))
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::Array3;
     use ndarray_npy::NpzWriter;
 
     /// A scene of bytes whose masks have this shape, and the folder that it is in.
@@ -277,7 +255,8 @@ mod tests {
     #[test]
     fn bands_hold_what_the_whole_has_in_their_rows() {
         let (_dir, path) = scene([2, 40, 6], 5);
-        let banded = Banded::open(&path, &Reading::default(), 20).unwrap();
+        let mut banded = Banded::open(&path, &Reading::default()).unwrap().unwrap();
+        banded.decide(20).unwrap();
         let whole = super::super::read(&path, &Reading::default()).unwrap();
         assert_eq!((banded.len(), banded.shape(), banded.unit), (2, whole.operator.shape(), 1.0));
         let band = banded.band(1, 10..30).unwrap();
@@ -294,7 +273,7 @@ mod tests {
             [([0, 4, 4], 3, "nothing is in it"), ([2, 0, 4], 3, "nothing"), ([4, 4, 4], 3, "3")]
         {
             let (_dir, path) = scene(masks, frames);
-            let error = Banded::outline(&path, &Reading::default()).unwrap_err().to_string();
+            let error = Banded::open(&path, &Reading::default()).unwrap_err().to_string();
             assert!(error.contains(said) && error.contains("scene.npz"), "{error}");
         }
     }

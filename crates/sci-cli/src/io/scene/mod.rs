@@ -134,6 +134,21 @@ pub enum Truth {
     Rgb(Array4<f32>),
 }
 
+impl Truth {
+    /// What a sensor with this pattern sees of it, `[T, H, W]`, and the color video if it is one.
+    pub fn seen(self, cfa: Option<CfaPattern>) -> (Array3<f32>, Option<Array4<f32>>) {
+        match self {
+            Self::Sensor(x) => (x, None),
+            Self::Rgb(rgb) => {
+                let (t, _, h, w) = rgb.dim();
+                let mut x = Array3::zeros((t, h, w));
+                mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
+                (x, Some(rgb))
+            }
+        }
+    }
+}
+
 impl Scene {
     /// Joins checked parts; measurements are simulated from the truth where `measurements` is `None`.
     ///
@@ -166,19 +181,15 @@ impl Scene {
         if let Some(m) = &measurements {
             check(&keys.meas, m.view())?;
         }
-        let (truth, rgb) = match truth {
-            None => (None, None),
-            Some(Truth::Sensor(x)) => {
-                check(&keys.orig, x.view())?;
-                (Some(x), None)
-            }
-            Some(Truth::Rgb(rgb)) => {
-                (0..3).try_for_each(|c| check(&keys.rgb, rgb.index_axis(Axis(1), c)))?;
-                let mut x = Array3::zeros((rgb.len_of(Axis(0)), height, width));
-                mosaic_into(cfa.unwrap_or_default(), rgb.view(), x.view_mut());
-                (Some(x), Some(rgb))
-            }
-        };
+        match &truth {
+            None => {}
+            Some(Truth::Sensor(x)) => check(&keys.orig, x.view())?,
+            Some(Truth::Rgb(rgb)) => (0..3).try_for_each(|c| check(&keys.rgb, rgb.index_axis(Axis(1), c)))?,
+        }
+        let (truth, rgb) = truth.map_or((None, None), |truth| {
+            let (x, rgb) = truth.seen(cfa);
+            (Some(x), rgb)
+        });
         let brightest = masks.reach();
         let operator = operator_of(masks);
         let mut warnings = Vec::new();
