@@ -31,6 +31,20 @@ fn switched_off_it_changes_no_bit() {
 }
 
 #[test]
+fn a_judge_tells_how_good_the_result_is_without_a_truth() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("tv.toml"), on_the_demo("gray/gap-tv.toml", RANDOM)).unwrap();
+    run(&bench, &bench.path("tv.toml"), "out", &["judge=true"]);
+    let record = bench.record("out");
+    let m = &record["measurements"][0];
+    let [predicted, psnr] = ["predicted_psnr_db", "psnr_db"].map(|key| m[key].as_f64().unwrap());
+    // Few pixels on edges have most of the error, and 441 are asked.
+    assert!((predicted - psnr).abs() < 3.0, "{predicted} dB predicted, {psnr} dB");
+    assert_eq!((&m["skipped"]["iterations"], &m["stop"]), (&0.into(), &"schedule_done".into()));
+    assert_eq!(record["config"]["judge"], true);
+}
+
+#[test]
 fn a_network_is_given_the_sigmas_that_auto_stands_for() {
     let bench = Bench::new();
     std::fs::write(bench.path("auto.toml"), on_the_demo("gray/auto.toml", RANDOM)).unwrap();

@@ -47,6 +47,37 @@ impl Denoiser for Blur {
 }
 
 #[test]
+fn a_judge_that_does_not_decide_only_tells() {
+    struct Told(Vec<Option<f64>>);
+    impl Observer for Told {
+        fn iteration(&mut self, it: &IterInfo<'_>) -> Result<ControlFlow<()>, BoxError> {
+            self.0.push(it.predicted_error);
+            Ok(ControlFlow::Continue(()))
+        }
+    }
+    let truth = moving_square(SHAPE);
+    let measurement = measurement_of(&truth);
+    let watching = HoldOut { decides: false, ..HoldOut::default() };
+    // A σ that a judge who decides would pass over, and more iterations than it would allow.
+    let stages = [Stage { sigma: Some(9.0), iterations: 1 }, Stage { sigma: None, iterations: 60 }];
+    let solve = |measurement: &Measurement, hold_out| {
+        let plan = Plan { hold_out, ..Plan::new(stages) };
+        let mut told = Told(Vec::new());
+        let mut solver = Gap::accelerated(Tv::new(0.3));
+        (run(&mut solver, measurement, Start::Mean, &plan, &mut told).unwrap(), told.0)
+    };
+    let (judged, told) = solve(&measurement, Some(watching));
+    let (plain, untold) = solve(&watching.given(&measurement), None);
+    assert_eq!(judged.estimate, plain.estimate);
+    assert_eq!((judged.iterations, judged.stop), (61, StopReason::ScheduleDone));
+    assert!(untold.iter().all(Option::is_none));
+    let predicted = told.last().copied().flatten().unwrap();
+    let ratio = predicted / error(&judged.estimate.sensor, &truth);
+    // The errors of a moving edge in frames that follow each other cancel in their sum.
+    assert!((0.2..1.5).contains(&ratio), "{ratio}");
+}
+
+#[test]
 fn a_run_ends_by_itself_close_to_the_best_iterate() {
     let truth = moving_square(SHAPE);
     let problem = measurement_of(&truth);

@@ -2,8 +2,8 @@
 
 use crate::layers::Conv;
 use crate::{
-    Ddnet, DdnetSpec, Ends, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network, Shiftnet,
-    ShiftnetSpec,
+    Ddnet, DdnetSpec, Ends, Experts, Fastdvdnet, FastdvdnetSpec, Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network,
+    Shiftnet, ShiftnetSpec,
 };
 use candle_core::{DType, Device, Tensor};
 use rand::{RngExt, SeedableRng};
@@ -91,7 +91,8 @@ fn gradients_of_ddnet_are_slopes() {
 #[test]
 fn gradients_of_shiftnet_are_slopes() {
     for channels in [1, 3] {
-        let spec = ShiftnetSpec { channels, widths: [16, 32, 16], blocks: [2, 1, 1] };
+        let spec =
+            ShiftnetSpec { channels, window: 3, widths: [16, 32, 16], blocks: [2, 1, 1], experts: Experts::default() };
         check(Shiftnet::random(spec, 4).unwrap(), [3, channels, 8, 13]);
     }
 }

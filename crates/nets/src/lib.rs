@@ -30,7 +30,7 @@ pub use ffdnet::{Ffdnet, FfdnetLayout, FfdnetSpec};
 pub use layers::Parameters;
 pub use mixed_precision::{MixedPrecision, PrecisionCounter, PrecisionCounts, SelectPrecision};
 pub use network::{Layers, Network, Window};
-pub use shiftnet::{Shiftnet, ShiftnetSpec};
+pub use shiftnet::{Experts, Shiftnet, ShiftnetSpec};
 pub use video::Ends;
 pub use weights::WeightFile;
 

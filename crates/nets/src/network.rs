@@ -117,6 +117,14 @@ pub trait Layers: Send + Sync {
         Ok(())
     }
 
+    /// Completes weights of a smaller network of the kind, so that they are this one's and its result stays the same.
+    ///
+    /// # Errors
+    /// When a tensor operation fails.
+    fn grow(&self, _weights: &mut BTreeMap<String, Tensor>) -> Result<(), Error> {
+        Ok(())
+    }
+
     /// Replaces every batch norm by the equal weight and bias of the convolution before it.
     ///
     /// # Errors

@@ -58,8 +58,13 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
 const FFDNET: NetworkConfig = NetworkConfig::Ffdnet { channels: 1, width: 8, depth: 3 };
 const FASTDVDNET: NetworkConfig =
     NetworkConfig::Fastdvdnet { channels: 1, widths: [4, 4, 4], ends: nets::Ends::Circular };
-const SHIFTNET: NetworkConfig = NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks: [1, 1, 1] };
+const SHIFTNET: NetworkConfig = shiftnet([1, 1, 1]);
 const DDNET: NetworkConfig = NetworkConfig::Ddnet { widths: [4, 4, 4], ends: nets::Ends::Mirrored };
+
+const fn shiftnet(blocks: [usize; 3]) -> NetworkConfig {
+    let experts = nets::Experts::NONE;
+    NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks, window: 1, experts }
+}
 
 fn trainer(config: &TrainConfig) -> Trainer {
     Trainer::new(config.clone(), data(config.network.channels())).unwrap()
@@ -241,7 +246,7 @@ fn shut_layers_that_begin_anew_are_open_and_leave_the_network_what_it_was() {
 fn a_network_that_grows_is_at_first_what_it_was() {
     let mut small = trainer(&config(SHIFTNET, 3, 8));
     run(&mut small, 8);
-    let more = NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks: [2, 1, 3] };
+    let more = shiftnet([2, 1, 3]);
     let grown = |renew: &[&str]| {
         let renew = renew.iter().map(|part| (*part).to_owned()).collect();
         let mut trainer = trainer(&TrainConfig { weights: Some("small".into()), renew, ..config(more.clone(), 3, 8) });

@@ -56,7 +56,7 @@ impl<'e> Factory<'e> {
             time: experiment.seconds.map(Duration::from_secs_f64),
             ..StopRule::default()
         };
-        plan.hold_out = experiment.skip.map(|s| s.hold_out);
+        plan.hold_out = experiment.judge;
         let sequence = experiment.online.map(|o| Sequence::new(o.sequence)).transpose()?;
         Ok(Self { experiment, parts, color, plan, sequence, multiply_adds })
     }

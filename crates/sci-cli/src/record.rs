@@ -138,6 +138,9 @@ pub struct MeasurementRecord {
     pub ssim_gaussian: Option<f64>,
     /// Mean PSNR of the RGB frames in dB; `None` for gray scenes.
     pub psnr_rgb_db: Option<f64>,
+    /// PSNR in dB that pixels which the solve was not given predict, with `[skip]` or `judge`, for errors that do not depend on each other.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub predicted_psnr_db: Option<f64>,
     /// In how many bands of rows it was solved, if in several: their trace is that of the band in the middle, and seconds are the sum.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bands: Option<usize>,

@@ -73,11 +73,11 @@ pub fn measurement(
     previous: Option<ArrayView3<'_, f32>>,
     show: &mut dyn Show,
 ) -> anyhow::Result<(MeasurementRecord, Estimate)> {
-    let (k, planned) = (left[0], factory.plan().iterations());
+    let k = left[0];
     let truth = scene.truth_of(k);
     let mut watch = Watch { truth, trace: Trace::default(), show };
     let solved = factory.solve(scene, left, previous, &mut watch).with_context(|| format!("measurement {k}"))?;
-    let mut record = measurement_record(k, &solved, watch.trace, planned);
+    let mut record = measurement_record(k, &solved, watch.trace, factory.plan());
     let estimate = solved.outcome.estimate;
     if let Some(truth) = truth {
         record.compare(truth, estimate.sensor.view());
@@ -98,12 +98,11 @@ pub fn band(
     learns: bool,
     show: &mut dyn Show,
 ) -> anyhow::Result<(MeasurementRecord, Estimate)> {
-    let planned = factory.plan().iterations();
     let mut watch = Watch { truth: scene.truth_of(0), trace: Trace::default(), show };
     let solved =
         if learns { factory.solve(scene, &[0], None, &mut watch) } else { factory.solve_as_learned(scene, &mut watch) };
     let solved = solved.with_context(|| format!("measurement {k}"))?;
-    let record = measurement_record(k, &solved, watch.trace, planned);
+    let record = measurement_record(k, &solved, watch.trace, factory.plan());
     Ok((record, solved.outcome.estimate))
 }
 
@@ -160,8 +159,9 @@ impl MeasurementRecord {
 }
 
 /// How measurement `index` went; `whole` are the iterations of the schedule.
-fn measurement_record(index: usize, solved: &Solved, trace: Trace, whole: usize) -> MeasurementRecord {
+fn measurement_record(index: usize, solved: &Solved, trace: Trace, plan: &Plan) -> MeasurementRecord {
     let Solved { outcome, planned, work, adaptation } = solved;
+    let (whole, decides) = (plan.iterations(), plan.hold_out.is_some_and(|hold_out| hold_out.decides));
     // Stopping early because nothing changes any more saves iterations, as does a start that needs fewer; being stopped
     // does not.
     let left = match outcome.stop {
@@ -169,12 +169,16 @@ fn measurement_record(index: usize, solved: &Solved, trace: Trace, whole: usize)
         StopReason::Diverged | StopReason::TimeUp | StopReason::Observer => 0,
     };
     let counts = adaptation.as_ref().map(|a| a.counts).unwrap_or_default();
+    let predicted = trace.predicted_error.iter().flatten().copied();
+    // The result is the best of the iterates where `[skip]` decides, else the last.
+    let predicted = if decides { predicted.reduce(f64::min) } else { predicted.last() };
     MeasurementRecord {
         index,
         psnr_db: None,
         ssim: None,
         ssim_gaussian: None,
         psnr_rgb_db: None,
+        predicted_psnr_db: predicted.filter(|error| *error > 0.0).map(|error| -10.0 * error.log10()),
         bands: None,
         seconds: outcome.seconds,
         iterations: outcome.iterations,

@@ -27,6 +27,8 @@ use sci_forward::Measurement;
 /// `patience` iterations: a smaller σ, which overshoots at first, would have made it fall again. A stage whose σ is more than `overshoot · √E`
 /// is not begun, unless it is the last: it would smooth more than there is to smooth.
 ///
+/// A judge that does not decide leaves the run as it is, and only tells E: how well a video was recovered of which there is no truth.
+///
 /// | Parameter | Default | Purpose | Range |
 /// |---|---|---|---|
 /// | `spacing` | 12 | one pixel in each `spacing` × `spacing` block is held out | ≥ 2 |
@@ -34,6 +36,7 @@ use sci_forward::Measurement;
 /// | `gain` | 0.015 | least share of E that an iteration takes off | `[0, 1)` |
 /// | `patience` | 3 | iterations to get below the best E of before | ≥ 2 |
 /// | `overshoot` | 2.2 | largest σ in units of `√E` | > 0 |
+/// | `decides` | true | whether E ends stages and chooses the result | |
 ///
 /// The defaults were chosen on clips that are in no benchmark. Mean of three of them, gray and color, dB: without it 25.96 and
 /// 25.52 (20 and 15 iterations); overshoot 1.6 26.27 and 25.19, 2.2 26.32 and 25.42, 3 26.09 and 25.46 (gain 0.03). Gain in
@@ -52,11 +55,13 @@ pub struct HoldOut {
     pub patience: usize,
     /// The largest σ of a stage, in units of `√E`.
     pub overshoot: f64,
+    /// Whether what they say changes the run; otherwise it is only told ([`IterInfo::predicted_error`](crate::IterInfo)).
+    pub decides: bool,
 }
 
 impl Default for HoldOut {
     fn default() -> Self {
-        Self { spacing: 12, seed: 0, gain: 0.015, patience: 3, overshoot: 2.2 }
+        Self { spacing: 12, seed: 0, gain: 0.015, patience: 3, overshoot: 2.2, decides: true }
     }
 }
 
@@ -217,6 +222,9 @@ impl<'a> Judge<'a> {
     /// Judges an iterate and keeps it if it is the best; returns E and what to do.
     pub(super) fn judge(&mut self, estimate: &Estimate, last_of_stage: bool) -> (f64, Verdict) {
         let error = self.held_out.error(estimate.sensor.view());
+        if !self.rule.config.decides {
+            return (error, Verdict::GoOn);
+        }
         match &mut self.best {
             Some((best, _)) if error >= *best => {}
             Some((best, kept)) => {
@@ -230,12 +238,12 @@ impl<'a> Judge<'a> {
 
     /// Whether a stage with this σ has nothing to do.
     pub(super) fn skips(&self, sigma: Option<f32>) -> bool {
-        self.rule.skips(sigma)
+        self.rule.config.decides && self.rule.skips(sigma)
     }
 
     /// For [`Call::tolerance`](crate::Call::tolerance).
     pub(super) fn tolerance(&self) -> f32 {
-        (TOLERANCE * self.rule.best.sqrt()) as f32
+        if self.rule.config.decides { (TOLERANCE * self.rule.best.sqrt()) as f32 } else { 0.0 }
     }
 
     pub(super) fn into_best(self) -> Option<Estimate> {

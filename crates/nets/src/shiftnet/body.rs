@@ -37,12 +37,18 @@ pub(crate) struct Body {
 }
 
 impl Body {
-    /// Channels found, widths and blocks by the tensors of a file.
-    pub(crate) fn recognise(file: &WeightFile) -> Option<(usize, [usize; LEVELS], [usize; LEVELS])> {
+    /// Whether a file has a body under names that begin so.
+    pub(crate) fn is_in(file: &WeightFile, prefix: &str) -> bool {
+        file.shape(&format!("{prefix}{PREFIX}input.weight")).is_some()
+    }
+
+    /// Channels shown and found, widths and blocks by the tensors of a file.
+    pub(crate) fn recognise(file: &WeightFile) -> Option<((usize, usize), [usize; LEVELS], [usize; LEVELS])> {
         let outputs = |name: &str| file.shape(&format!("{PREFIX}{name}.weight"))?.first().copied();
         let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
         let blocks = |place: &str| (0..).take_while(|k| outputs(&format!("{place}.{k}.0")).is_some()).count();
-        Some((outputs("output")?, widths, ["enter0", "enter1", "deepest"].map(blocks)))
+        let shown = *file.shape(&format!("{PREFIX}input.weight"))?.get(1)?;
+        Some(((shown, outputs("output")?), widths, ["enter0", "enter1", "deepest"].map(blocks)))
     }
 
     pub(crate) fn validate(self) -> Result<()> {
@@ -115,12 +121,12 @@ impl Body {
         sum
     }
 
-    /// The layers.
-    pub(crate) fn build(self, source: &mut Source<'_>) -> Result<Vec<Conv>> {
+    /// The layers, under names that begin so.
+    pub(crate) fn build(self, source: &mut Source<'_>, prefix: &str) -> Result<Vec<Conv>> {
         let layer = |LayerSpec { name, inputs, outputs, stride, relu, bias, .. }| {
             let opts = Conv3x3 { stride, relu, ..Conv3x3::default() };
             let shift = if bias { Shift::Bias } else { Shift::Nothing };
-            Conv::new(source, format!("{PREFIX}{name}"), (inputs, outputs), opts, shift)
+            Conv::new(source, format!("{prefix}{PREFIX}{name}"), (inputs, outputs), opts, shift)
         };
         self.layers().into_iter().map(layer).collect()
     }
@@ -133,11 +139,13 @@ impl Body {
         Ok(())
     }
 
-    /// Which layers' results are shuffled, and which are held in f32: all but those inside residual blocks.
-    pub(crate) fn results(self) -> (Vec<usize>, Vec<usize>) {
+    /// Of so many bodies one after another, which layers' results are shuffled, and which are held in f32: all but those inside residual
+    /// blocks.
+    pub(crate) fn results(self, bodies: usize) -> (Vec<usize>, Vec<usize>) {
         let layers = self.layers();
         let which = |wanted: fn(&LayerSpec) -> bool| {
-            layers.iter().enumerate().filter(|(_, layer)| wanted(layer)).map(|(i, _)| i).collect()
+            let all = std::iter::repeat_n(&layers, bodies).flatten().enumerate();
+            all.filter(|(_, layer)| wanted(layer)).map(|(i, _)| i).collect()
         };
         (which(|layer| layer.name.starts_with("up")), which(|layer| !(layer.relu && layer.stride == 1)))
     }
@@ -174,9 +182,9 @@ impl Body {
         chain(layers(1), &[], &h)
     }
 
-    /// Without gradients: all but the first and the last layer, for the features of all frames.
-    pub(crate) fn between(self, engine: &mut Engine, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
-        let mut next = 1;
+    /// Without gradients: all but the first and the last layer, for the features of all frames; `first` is the number of the first.
+    pub(crate) fn between(self, engine: &mut Engine, first: usize, mut h: Vec<Blocked>) -> Result<Vec<Blocked>> {
+        let mut next = first + 1;
         let mut above: Vec<Vec<Blocked>> = Vec::new();
         for (_, step) in self.steps() {
             match step {

@@ -2,7 +2,7 @@
 
 use crate::kernels::Precision;
 use crate::video::Ends;
-use crate::{Architecture, DdnetSpec, Error, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec};
+use crate::{Architecture, DdnetSpec, Error, Experts, FastdvdnetSpec, FfdnetLayout, FfdnetSpec, Result, ShiftnetSpec};
 use candle_core::Tensor;
 use ndarray::Array4;
 use serde::{Deserialize, Serialize};
@@ -86,6 +86,12 @@ pub enum NetworkConfig {
         widths: [usize; 3],
         /// Residual blocks at these sizes, at a half and a quarter as many on the way up again: 1 to 16 each.
         blocks: [usize; 3],
+        /// Frames that the first layer sees at once, 1 or 3. Default 1.
+        #[serde(default = "one")]
+        window: usize,
+        /// Where other weights begin: up to three σ in 0..255 units, each lower than the one before. Default none.
+        #[serde(default)]
+        experts: Experts,
     },
 }
 
@@ -111,8 +117,8 @@ impl NetworkConfig {
                 (Architecture::Fastdvdnet(FastdvdnetSpec { channels, widths, batch_norm: false }), ends)
             }
             Self::Ddnet { widths, ends } => (Architecture::Ddnet(DdnetSpec { widths }), ends),
-            Self::Shiftnet { channels, widths, blocks } => {
-                (Architecture::Shiftnet(ShiftnetSpec { channels, widths, blocks }), Ends::default())
+            Self::Shiftnet { channels, widths, blocks, window, experts } => {
+                (Architecture::Shiftnet(ShiftnetSpec { channels, window, widths, blocks, experts }), Ends::default())
             }
         }
     }
@@ -120,8 +126,15 @@ impl NetworkConfig {
     /// Checks the network's size.
     fn validate(&self) -> Result<()> {
         // The network knows its keys, not the table that they are in.
-        const KEYS: [&str; 5] =
-            ["network.channels", "network.width", "network.widths", "network.depth", "network.blocks"];
+        const KEYS: [&str; 7] = [
+            "network.channels",
+            "network.width",
+            "network.widths",
+            "network.depth",
+            "network.blocks",
+            "network.window",
+            "network.experts",
+        ];
         self.architecture().0.validate().map_err(|error| match error {
             Error::Setting { key, value, legal } => {
                 let key = KEYS.into_iter().find(|known| known.ends_with(&format!(".{key}"))).unwrap_or(key);
@@ -288,16 +301,22 @@ pub enum Loss {
     L1,
     /// Squared error.
     L2,
+    /// Half the logarithm of the mean squared error of a clip (of a batch, where it is not reconstructed), which is PSNR: each clip counts
+    /// alike, however hard it is.
+    Psnr,
 }
+
+/// Keeps the logarithm of [`Loss::Psnr`] finite: 60 dB.
+const LEAST_ERROR: f64 = 1e-6;
 
 impl Loss {
     /// The mean over all values of an error.
     pub(super) fn mean(self, error: &Tensor) -> candle_core::Result<Tensor> {
         match self {
-            Self::L1 => error.abs()?,
-            Self::L2 => error.sqr()?,
+            Self::L1 => error.abs()?.mean_all(),
+            Self::L2 => error.sqr()?.mean_all(),
+            Self::Psnr => (error.sqr()?.mean_all()? + LEAST_ERROR)?.log()? * 0.5,
         }
-        .mean_all()
     }
 
     /// The mean over all values of an error, and its derivative by each.
@@ -305,10 +324,14 @@ impl Loss {
         let count = error.len().max(1) as f64;
         let of = |e: f32| match self {
             Self::L1 => (e.abs(), if e == 0.0 { 0.0 } else { e.signum() }),
-            Self::L2 => (e * e, 2.0 * e),
+            Self::L2 | Self::Psnr => (e * e, 2.0 * e),
         };
-        let sum: f64 = error.iter().map(|&e| f64::from(of(e).0)).sum();
-        ((sum / count) as f32, error.mapv(|e| of(e).1 / count as f32))
+        let mean = error.iter().map(|&e| f64::from(of(e).0)).sum::<f64>() / count;
+        let (loss, slope) = match self {
+            Self::L1 | Self::L2 => (mean, 1.0),
+            Self::Psnr => (0.5 * (mean + LEAST_ERROR).ln(), 0.5 / (mean + LEAST_ERROR)),
+        };
+        (loss as f32, error.mapv(|e| of(e).1 * (slope / count) as f32))
     }
 }
 

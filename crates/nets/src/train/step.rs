@@ -161,7 +161,8 @@ impl Trainer {
         Ok(Self { config, data, model, vars, adam, average, idle, random: true, rate: 1.0, step: 0 })
     }
 
-    /// Begins with these weights instead of random ones, but for the layers of [`TrainConfig::renew`], which the file may lack.
+    /// Begins with these weights, or those of a smaller network of the kind, instead of random ones, but for the layers of
+    /// [`TrainConfig::renew`], which the file may lack.
     ///
     /// # Errors
     /// [`Error::State`] when names or shapes are not those of the network, [`Error::Setting`] when it has no layer of such a name.
@@ -172,7 +173,9 @@ impl Trainer {
             return Err(Error::Setting { key: "renew", value: part.clone(), legal });
         }
         let renewed = random.into_iter().filter(|(name, _)| self.config.renews(name));
-        self.model.set_state(&weights.clone().into_iter().chain(renewed).collect())?;
+        let mut weights = weights.clone();
+        self.model.grow(&mut weights)?;
+        self.model.set_state(&weights.into_iter().chain(renewed).collect())?;
         self.vars = self.model.make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
         self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;

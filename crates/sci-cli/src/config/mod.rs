@@ -14,6 +14,7 @@ mod stage;
 use std::path::Path;
 
 use ::online::AdaptLoss;
+use admm::HoldOut;
 use nets::unrolled::Recipe;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -64,6 +65,8 @@ pub struct Experiment {
     pub recipe: Option<Recipe>,
     /// The memory that a solve may take, in bytes, if it is limited.
     pub memory: Option<usize>,
+    /// The pixels that a solve is not given and that judge it, if there are any: with `[skip]` or `judge`.
+    pub judge: Option<HoldOut>,
     /// What to write.
     pub output: Output,
     /// The keys of its tables, defaults filled in.
@@ -155,6 +158,7 @@ struct Tables<'s> {
     name: Option<String>,
     seed: u64,
     memory: Option<usize>,
+    judge: bool,
     data: Option<Table<'s>>,
     solver: Option<Table<'s>>,
     schedule: stage::Tables<'s>,
@@ -175,6 +179,7 @@ impl<'s> Tables<'s> {
             name: t.text("name", legal, |n| n.split('/').all(part_ok)),
             seed: t.seed("seed", 0),
             memory: t.legal("memory", MEMORY, |v| v.as_str().and_then(bytes)),
+            judge: t.flag("judge", false),
             data: t.table("data")?,
             solver: t.table("solver")?,
             schedule: stage::Tables::take(t)?,
@@ -211,6 +216,7 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
     let missing = |key: &str| source.file_error(format!("no [{key}] table"));
     let stem = || source.path().file_stem().map_or("experiment".into(), |s| s.to_string_lossy().into_owned());
     let (name, seed, memory) = (tables.name.unwrap_or_else(stem), tables.seed, tables.memory);
+    let judge = tables.judge.then_some(HoldOut { seed, decides: false, ..HoldOut::default() });
     let (data, data_json) = tables.data.ok_or_else(|| missing("data"))?.read(|t| Data::read(t, seed))?;
     let solver = solvers::read(tables.solver.ok_or_else(|| missing("solver"))?)?;
     let (mut skip, mut skip_json) = unless_off(tables.skip, |t| Skip::read(t, seed))?;
@@ -232,6 +238,9 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
     if let Some(memory) = memory {
         json["memory"] = memory.into();
     }
+    if judge.is_some() {
+        json["judge"] = true.into();
+    }
     let written = Written::of(source, arguments);
     let mut experiment = Experiment {
         name,
@@ -246,6 +255,7 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         online,
         recipe: None,
         memory,
+        judge: skip.map(|skip| skip.hold_out).or(judge),
         output,
         json,
         written,

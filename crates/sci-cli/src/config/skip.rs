@@ -37,6 +37,7 @@ impl Skip {
             gain: t.number("gain", default.gain, 0.0..=0.5),
             patience: t.whole("patience", default.patience, 2..=1024),
             overshoot: t.number("overshoot", default.overshoot, OVERSHOOT),
+            decides: true,
         };
         let skip = Self {
             hold_out,

@@ -72,6 +72,7 @@ pub(super) fn line(m: &MeasurementRecord) -> String {
         }
         _ => format!("residual {:.2e}", m.relative_residual.unwrap_or(f64::NAN)),
     };
+    let predicted = m.predicted_psnr_db.map_or(String::new(), |p| format!("   predicted {p:.2} dB"));
     let note = match m.stop {
         Stop::ScheduleDone => "",
         Stop::Converged => "   converged",
@@ -93,7 +94,7 @@ pub(super) fn line(m: &MeasurementRecord) -> String {
     let (k, iterations, seconds) = (m.index, m.iterations, m.seconds);
     let bands = m.bands.map_or(String::new(), |n| format!(" in {n} bands"));
     format!(
-        "measurement {k:>2}   {quality}   {iterations} iterations   {seconds:.2} s{bands}{updates}{backed_off}{note}"
+        "measurement {k:>2}   {quality}{predicted}   {iterations} iterations   {seconds:.2} s{bands}{updates}{backed_off}{note}"
     )
 }
 
