@@ -7,6 +7,7 @@ mod circles;
 mod large;
 mod pareto;
 mod plot;
+mod real;
 mod repro;
 mod robust;
 mod sensitivity;
@@ -26,6 +27,8 @@ enum Task {
     Bench(Bench),
     /// The paper's tables, cell by cell, beside what this program gives
     Repro(repro::Options),
+    /// The paper's sections of captured data: a table, and a page of pictures
+    Real(real::Options),
     /// Feed every solver what no one should feed it, and print how each case ended
     Stress(stress::Options),
     /// Read damaged files and experiments, more than a million
@@ -54,6 +57,7 @@ fn main() -> anyhow::Result<()> {
     match Task::parse() {
         Task::Tidy => tidy::run(),
         Task::Repro(options) => repro::run(&options),
+        Task::Real(options) => real::run(&options),
         Task::Stress(options) => stress::run(&options),
         Task::Fuzz(options) => stress::fuzz(&options),
         Task::Bench(Bench::GapTv(options)) => bench::solver("gap-tv", &options),

@@ -91,11 +91,17 @@ impl Sci {
 
     /// `sci run CONFIG --set ...`, without pictures. What it left is there until the next run.
     pub(crate) fn run(&self, config: &Path, sets: &[String]) -> anyhow::Result<Finished> {
-        let folder = self.runs.path().join("run");
-        let _ = std::fs::remove_dir_all(&folder);
+        let sets: Vec<String> = std::iter::once("output=minimal".to_owned()).chain(sets.iter().cloned()).collect();
+        self.run_into(&self.runs.path().join("run"), config, &sets)
+    }
+
+    /// The same with its pictures, into a folder that is removed before.
+    pub(crate) fn run_into(&self, folder: &Path, config: &Path, sets: &[String]) -> anyhow::Result<Finished> {
+        if folder.exists() {
+            std::fs::remove_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
         let mut command = Command::new(&self.program);
-        command.arg("run").arg(config).arg("--out").arg(&folder).env("SCI_DATA", &self.data);
-        command.args(["--set", "output=minimal"]);
+        command.arg("run").arg(config).arg("--out").arg(folder).env("SCI_DATA", &self.data);
         sets.iter().for_each(|set| {
             command.arg("--set").arg(set);
         });
@@ -105,7 +111,7 @@ impl Sci {
             code: output.status.code(),
             stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
             record: record.map(|r| serde_json::from_str(&r)).transpose()?,
-            folder,
+            folder: folder.to_owned(),
         })
     }
 }

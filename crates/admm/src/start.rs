@@ -11,7 +11,8 @@ pub enum Start<'a> {
     /// Pixels that no mask opens get the mean of the others. Masks of both signs may add up to nothing: then the scene is taken to be even
     /// over some pixels too ([`brightness`]).
     Mean,
-    /// `Hᵀ y`, the reference code's start. It is not normalised: values reach about `B²/4`.
+    /// `Hᵀ y`, the reference code's start. It is not normalised: values reach about `B²/4`. At clipped pixels it is, `Hᵀ y / diag(H Hᵀ)`: they
+    /// say that there was as much light or more, so that nothing would take away what is too much.
     Adjoint,
     /// A given video `[T, H, W]`, for example the result of the previous measurement.
     From(ArrayView3<'a, f32>),
@@ -41,7 +42,7 @@ impl Start<'_> {
     pub(crate) fn estimate(&self, measurement: &Measurement) -> Result<Estimate, SolveError> {
         let video = match self {
             Self::Mean => mean(measurement),
-            Self::Adjoint | Self::Warm { .. } => measurement.operator().adjoint(measurement.y()),
+            Self::Adjoint | Self::Warm { .. } => adjoint(measurement),
             Self::From(video) => given(*video, measurement)?,
         };
         match video.indexed_iter().find(|(_, v)| !v.is_finite()) {
@@ -58,6 +59,13 @@ fn given(video: ArrayView3<'_, f32>, measurement: &Measurement) -> Result<Array3
         return Err(SolveError::Size { what: "start", expected: list(expected), found: list(video.dim()) });
     }
     Ok(video.as_standard_layout().into_owned())
+}
+
+fn adjoint(measurement: &Measurement) -> Array3<f32> {
+    let operator = measurement.operator();
+    let Some(level) = measurement.clip() else { return operator.adjoint(measurement.y()) };
+    let of_pixel = |&y: &f32, &gram: &f32| if y >= level && gram > 0.0 { y / gram } else { y };
+    operator.adjoint(Zip::from(measurement.y()).and(operator.gram()).map_collect(of_pixel).view())
 }
 
 /// Pixels to each side over which a scene is taken to be even, where a pixel alone says nothing.

@@ -491,12 +491,31 @@ fn clipped_pixels_say_that_there_was_as_much_light_or_more() {
     let believed = Measurement::new(operator, y.clone()).unwrap();
     let left_out = believed.restricted(y.mapv(|y| y < level).view()).unwrap();
     let one_sided = believed.clone().with_clip(Some(level));
-    let error = |measurement: &Measurement| {
+    let solve = |measurement: &Measurement, start: Start<'_>| {
         let plan = Plan::new([Stage { sigma: None, iterations: 40 }]);
-        let outcome = run(&mut Gap::accelerated(Tv::new(0.1)), measurement, Start::Mean, &plan, &mut ()).unwrap();
+        let outcome = run(&mut Gap::accelerated(Tv::new(0.1)), measurement, start, &plan, &mut ()).unwrap();
         assert_eq!(outcome.stop, StopReason::ScheduleDone);
         (outcome.estimate.sensor - &truth).mapv(|d| d * d).mean().unwrap()
     };
-    let [believed, left_out, one_sided] = [&believed, &left_out, &one_sided].map(error);
+    let [believed, left_out, one_sided] =
+        [&believed, &left_out, &one_sided].map(|measurement| solve(measurement, Start::Mean));
     assert!(one_sided < 0.95 * left_out && left_out < 0.5 * believed, "{one_sided} {left_out} {believed}");
+}
+
+/// The adjoint is too bright; what nothing takes away again must not be in it.
+#[test]
+fn clipped_pixels_do_not_keep_the_light_of_the_adjoint() {
+    let shape = VideoShape { frames: 16, height: 48, width: 48 };
+    let truth = moving_square(shape).mapv(|x| 0.3 + 0.5 * x);
+    let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap()));
+    let level = 3.0;
+    let y = operator.forward(truth.view()).mapv(|y| y.min(level));
+    let measurement = Measurement::new(operator, y).unwrap().with_clip(Some(level));
+    let error = |start: Start<'_>| {
+        let plan = Plan::new([Stage { sigma: None, iterations: 40 }]);
+        let outcome = run(&mut Gap::accelerated(Tv::new(0.1)), &measurement, start, &plan, &mut ()).unwrap();
+        (outcome.estimate.sensor - &truth).mapv(|d| d * d).mean().unwrap()
+    };
+    let [mean, adjoint] = [Start::Mean, Start::Adjoint].map(error);
+    assert!(adjoint < 1.5 * mean, "{adjoint} {mean}");
 }
