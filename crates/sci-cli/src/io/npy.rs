@@ -87,7 +87,8 @@ fn header_of(text: &str) -> Result<Header, ReadError> {
 pub(super) fn read_header(file: &mut impl Read) -> Result<(Header, u64), ReadError> {
     let mut bytes = vec![0; 12];
     file.read_exact(&mut bytes).map_err(ReadError::Io)?;
-    let missing = header_length(&bytes)?.end - bytes.len();
+    // A header may be said to end before.
+    let missing = header_length(&bytes)?.end.saturating_sub(bytes.len());
     file.take(missing as u64).read_to_end(&mut bytes).map_err(ReadError::Io)?;
     let (text, _) = split_header(&bytes)?;
     Ok((header_of(text)?, bytes.len() as u64))
@@ -390,6 +391,8 @@ mod tests {
                 let _ = read_npy(&b);
             }
         }
+        let ends_at_once = [MAGIC, &[1, 0, 0, 0, 0, 0]].concat();
+        assert!(read_header(&mut ends_at_once.as_slice()).is_err());
         let mut forged = MAGIC.to_vec();
         forged.extend([1, 0, 70, 0]);
         forged
