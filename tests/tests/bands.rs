@@ -4,7 +4,7 @@ use std::fs;
 use std::io::Cursor;
 use std::process::Stdio;
 
-use e2e::{Bench, assert_same, wait_for};
+use e2e::{Bench, assert_same, wait_for, workspace};
 use ndarray::{Array3, Array4, Axis, s};
 use ndarray_npy::{NpzWriter, ReadNpyExt, WriteNpyExt};
 
@@ -145,6 +145,88 @@ fn a_color_scene_has_what_the_middle_of_its_bands_would_have_alone() {
     let rows = off.mean_axis(Axis(0)).unwrap().mean_axis(Axis(0)).unwrap().mean_axis(Axis(1)).unwrap();
     let worst = rows.slice(s![..]).iter().fold(0.0f32, |most, &r| most.max(r));
     assert!(worst < 1e-4, "{worst}");
+}
+
+/// A scene of bytes as a plain `.npz`, with the truth under this name.
+fn write_scene(bench: &Bench, (frames, height, width): (usize, usize, usize), truth: &str) {
+    let mut state = 1u32;
+    let masks = Array3::from_shape_simple_fn((frames, height, width), || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (state >> 31) as u8
+    });
+    let value = |t: usize, y: usize, x: usize| {
+        128.0 + 90.0 * ((t + 3 * x) as f32 * 0.05).sin() * ((y + 2 * t) as f32 * 0.1).cos()
+    };
+    let mut npz = NpzWriter::new(fs::File::create(bench.path("scene.npz")).unwrap());
+    npz.add_array("mask", &masks).unwrap();
+    match truth {
+        "rgb" => {
+            let color = |(t, y, x, c)| (value(t, y, x) - 20.0 * c as f32) as u8;
+            npz.add_array(truth, &Array4::from_shape_fn((frames, height, width, 3), color)).unwrap();
+        }
+        _ => {
+            let gray = |(t, y, x)| value(t, y, x) as u8;
+            npz.add_array(truth, &Array3::from_shape_fn((frames, height, width), gray)).unwrap();
+        }
+    }
+    npz.finish().unwrap();
+}
+
+/// Networks work at an eighth of the size, and are shown the video upside down too: bands lie on the grid of the whole, and are continued
+/// at the same side.
+#[test]
+fn bands_of_a_network_are_the_whole_whatever_the_height() {
+    let bench = Bench::new();
+    let config = workspace().join("configs/gray/fast.toml");
+    let stage = "stage=[{sigma=[20,16,12,9],iterations=1}]";
+    for height in [483, 485] {
+        write_scene(&bench, (4, height, 203), "orig");
+        for (out, memory) in [("whole", "4 GiB"), ("bands", "150 MB")] {
+            let (path, out) = (bench.path("scene.npz"), format!("{out}-{height}"));
+            let path = format!("data.path={}", path.display());
+            let memory = format!("memory=\"{memory}\"");
+            let config = config.to_str().unwrap();
+            let run = bench.sci(&["run", config, "--out", &out, "--set", &path, "--set", &memory, "--set", stage]);
+            assert_eq!(run.code, 0, "{}{}", run.stdout, run.stderr);
+        }
+        let of = |run: &str| bench.record(&format!("{run}-{height}"))["measurements"][0].clone();
+        let (whole, bands) = (of("whole"), of("bands"));
+        assert!(whole["bands"].is_null() && bands["bands"].as_u64() > Some(1), "{bands}");
+        let off = (whole["psnr_db"].as_f64().unwrap() - bands["psnr_db"].as_f64().unwrap()).abs();
+        assert!(off < 0.003, "{height} rows: {off} dB");
+        let most = difference(&bench, &format!("whole-{height}"), &format!("bands-{height}"));
+        assert!(most < 0.02, "{height} rows: {most}");
+    }
+}
+
+/// The experiments for large recordings, each in bands of a small one, and learning in no more memory than is allowed.
+#[test]
+fn large_experiments_run_to_the_end_in_their_memory() {
+    let bench = Bench::new();
+    write_scene(&bench, (4, 1000, 96), "rgb");
+    let path = format!("data.path={}", bench.path("scene.npz").display());
+    let learning: &[&str] = &["online.side=32", "online.updates=2", "online.judged_crops=2"];
+    let experiments: [(&str, u64, &[&str]); 4] = [
+        ("gap-tv", 128, &[]),
+        ("gap-ffdnet", 128, &["denoiser.weights=bundled:ffdnet_color"]),
+        ("fast", 160, &[]),
+        ("adaptive", 300, learning),
+    ];
+    let shipped = fs::read_dir(workspace().join("configs/large")).unwrap();
+    assert_eq!(shipped.count(), experiments.len(), "each of configs/large is run");
+    for (name, megabytes, sets) in experiments {
+        let config = workspace().join(format!("configs/large/{name}.toml"));
+        let memory = format!("memory=\"{megabytes} MB\"");
+        let stage = if name == "gap-tv" { "stage=[{iterations=2}]" } else { "stage=[{sigma=20,iterations=1}]" };
+        let mut arguments = vec!["run", config.to_str().unwrap(), "--out", name];
+        [path.as_str(), &memory, stage].iter().chain(sets).for_each(|set| arguments.extend(["--set", set]));
+        let run = bench.sci(&arguments);
+        assert_eq!(run.code, 0, "{name}: {}{}", run.stdout, run.stderr);
+        let record = bench.record(name);
+        assert!(record["measurements"][0]["bands"].as_u64() > Some(1), "{name}");
+        let used = record["peak_rss_bytes"].as_u64().unwrap();
+        assert!(used < megabytes * 1_000_000, "{name}: {used} bytes");
+    }
 }
 
 #[test]

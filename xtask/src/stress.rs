@@ -249,10 +249,10 @@ fn cases() -> Vec<Case> {
             &[],
             Ends::Refused("every mask is zero"),
         ),
-        ("B = 1", Scene::new(1, 48, 40), GAP_TV, &[], Ends::Result(60.0)),
+        ("B = 1", Scene::new(1, 48, 40), GAP_TV, &[], Ends::Result(70.0)),
         ("B = 64", Scene::new(64, 48, 40), GAP_TV, &[], Ends::Result(23.0)),
         ("2×2", Scene::new(8, 2, 2), GAP_TV, &[], Ends::Result(15.0)),
-        ("1×4096", Scene::new(8, 1, 4096), GAP_TV, &[], Ends::Result(60.0)),
+        ("1×4096", Scene::new(8, 1, 4096), GAP_TV, &[], Ends::Result(90.0)),
         ("2,000 iterations", small(), GAP_TV, &["stage.0.iterations=2000"], Ends::Result(26.0)),
         ("2,000 iterations, ADMM", small(), ADMM_TV, &["stage.0.iterations=2000"], Ends::Result(26.0)),
         (
@@ -293,7 +293,7 @@ fn cases() -> Vec<Case> {
         ("FFDNet, 2×2", Scene::new(8, 2, 2), FFDNET, &[], Ends::Result(21.0)),
         ("FFDNet, 1×4096", Scene::new(8, 1, 4096), FFDNET, &[], Ends::Result(21.0)),
         ("FFDNet, 12 hot pixels", small().defects(8.0), FFDNET, &[], Ends::Result(16.0)),
-        ("FFDNet, 500 iterations", Scene::new(8, 24, 20), FFDNET, &["stage.0.iterations=500"], Ends::Result(30.0)),
+        ("FFDNet, 500 iterations", Scene::new(8, 24, 20), FFDNET, &["stage.0.iterations=500"], Ends::Result(39.0)),
     ]
 }
 
@@ -351,5 +351,39 @@ fn outcome(finished: &Finished, recon: &[u8], ends: Ends) -> Result<String, Stri
         (Ends::Refused(why), Some(1 | 2), None) => says(why)
             .map_or_else(otherwise, |line| Ok(line.rsplit('/').next().unwrap_or_default().chars().take(160).collect())),
         _ => otherwise(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    /// A run that ended like this, with one sample in its result.
+    fn ended(code: i32, psnr_db: Option<f64>, stderr: &str, sample: f32, ends: Ends) -> Result<String, String> {
+        let record = psnr_db.map(|psnr_db| json!({ "mean": { "psnr_db": psnr_db } }));
+        let finished = Finished { code: Some(code), stderr: stderr.into(), record, folder: PathBuf::new() };
+        outcome(&finished, &npy([1, 1, 1], &[sample]), ends)
+    }
+
+    #[test]
+    fn a_result_below_its_floor_is_a_fault_and_so_is_any_other_end() {
+        let floor = Ends::Result(26.0);
+        assert!(ended(0, Some(26.1), "", 0.5, floor).is_ok());
+        let refused = Ends::Refused("not legal");
+        for (code, psnr_db, stderr, sample, ends, said) in [
+            (0, Some(25.9), "", 0.5, floor, "25.9 dB, expected 26"),
+            (0, Some(30.0), "", f32::NAN, floor, "NaN in recon.npy"),
+            (0, None, "", 0.5, floor, "exit code"),
+            (1, Some(30.0), "", 0.5, floor, "exit code"),
+            (101, None, "thread panicked at", 0.5, refused, "panicked"),
+            (2, None, "something else", 0.5, refused, "something else"),
+            (0, Some(30.0), "", 0.5, Ends::Diverged, "exit code"),
+        ] {
+            let fault = ended(code, psnr_db, stderr, sample, ends).unwrap_err();
+            assert!(fault.contains(said), "{fault}");
+        }
+        assert!(ended(2, None, "x.toml: `a` is not legal", 0.5, refused).is_ok());
+        assert!(ended(1, Some(9.0), "it diverged in iteration 3", 0.5, Ends::Diverged).is_ok());
     }
 }

@@ -29,18 +29,23 @@ pub struct Footprint {
     pub of_frame_pixel: usize,
     /// For each pixel of the sensor, whatever the number of frames.
     pub of_pixel: usize,
+    /// For each frame, whatever its size.
+    pub of_frame: usize,
+    /// Whatever the scene.
+    pub fixed: usize,
 }
 
 impl Footprint {
     /// Bytes for a scene of this size.
     pub fn bytes(self, shape: VideoShape) -> usize {
-        PROGRAM + shape.height * shape.width * (shape.frames * self.of_frame_pixel + self.of_pixel)
+        let pixels = shape.height * shape.width;
+        PROGRAM + self.fixed + shape.frames * (self.of_frame + pixels * self.of_frame_pixel) + pixels * self.of_pixel
     }
 
     /// How many rows of a scene fit into `memory` bytes.
     fn rows(self, shape: VideoShape, memory: usize) -> usize {
-        let one = Self::bytes(self, VideoShape { height: 1, ..shape }) - PROGRAM;
-        memory.saturating_sub(PROGRAM) / one.max(1)
+        let [none, one] = [0, 1].map(|height| self.bytes(VideoShape { height, ..shape }));
+        memory.saturating_sub(none) / (one - none).max(1)
     }
 }
 
@@ -228,7 +233,7 @@ mod tests {
     use super::*;
 
     const SHAPE: VideoShape = VideoShape { frames: 8, height: 2160, width: 3840 };
-    const FOOTPRINT: Footprint = Footprint { of_frame_pixel: 50, of_pixel: 300 };
+    const FOOTPRINT: Footprint = Footprint { of_frame_pixel: 50, of_pixel: 300, of_frame: 1 << 20, fixed: 10 << 20 };
 
     #[test]
     fn bands_fit_cover_every_row_and_share_it() {
@@ -262,7 +267,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let shape = VideoShape { frames: 2, height: 700, width: 6 };
         let bands =
-            Bands::new(shape, Footprint { of_frame_pixel: 0, of_pixel: 1 << 16 }, PROGRAM + (110 << 20)).unwrap();
+            Bands::new(shape, Footprint { of_pixel: 1 << 16, ..Footprint::default() }, PROGRAM + (110 << 20)).unwrap();
         assert!(bands.count() > 2, "{bands:?}");
         let video = Array4::from_shape_fn((2, 3, 700, 6), |(t, c, y, x)| (t + 2 * c + y * x) as f32 / 4096.0);
         let paths: Vec<PathBuf> = (0..bands.count()).map(|band| dir.path().join(format!("{band}.npy"))).collect();

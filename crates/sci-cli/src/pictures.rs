@@ -20,7 +20,9 @@ use crate::run_folder::{Finished, PREVIEW, frame_name, read_video};
 /// The file of a measurement's piece of the report.
 pub const PIECE: &str = "report.json";
 /// A preview is halved until its longer side is at most this.
-const PREVIEW_SIDE: usize = 1000;
+const PREVIEW_SIDE: usize = 640;
+/// The same of what the page shows of a measurement that is too large for memory.
+const PAGE_SIDE: usize = 1000;
 
 /// A measurement that has just been solved.
 #[derive(Debug)]
@@ -93,7 +95,7 @@ impl Studio<'_> {
         finished.make_pictures(|dir| {
             let frames = if self.output.frames { Some(self.frames(dir, index, result)?) } else { None };
             if self.output.preview {
-                self.preview(&dir.join(PREVIEW), result)?;
+                preview(&dir.join(PREVIEW), result, self.output.fps)?;
             }
             if self.output.report {
                 self.piece(&dir.join(PIECE), index, result, frames)?;
@@ -132,9 +134,9 @@ impl Studio<'_> {
                     let whole = whole.seen(scene.cfa);
                     let shown = whole.1.unwrap_or_else(|| whole.0.insert_axis(Axis(1)));
                     psnr_db.push(report::pictures::psnr(shown.index_axis(Axis(0), 0), frame.view()));
-                    truth.push(frames::shrunk(shown.view(), PREVIEW_SIDE));
+                    truth.push(frames::shrunk(shown.view(), PAGE_SIDE));
                 }
-                small.push(frames::shrunk(frame.insert_axis(Axis(0)).view(), PREVIEW_SIDE));
+                small.push(frames::shrunk(frame.insert_axis(Axis(0)).view(), PAGE_SIDE));
             }
             let joined = |videos: &[Array4<f32>]| {
                 let views: Vec<_> = videos.iter().map(|video| video.view()).collect();
@@ -142,11 +144,11 @@ impl Studio<'_> {
             };
             let small = joined(&small)?;
             if output.preview {
-                write_atomically(&dir.join(PREVIEW), |w| video::write_gif(w, small.view(), output.fps))?;
+                preview(&dir.join(PREVIEW), small.view(), output.fps)?;
             }
             if output.report {
                 let y = scene.y(index).map_err(|e| fail(e.into()))?.insert_axis(Axis(0)).insert_axis(Axis(0));
-                let y = frames::shrunk(y.view(), PREVIEW_SIDE);
+                let y = frames::shrunk(y.view(), PAGE_SIDE);
                 let truth = if truth.is_empty() { None } else { Some(joined(&truth)?) };
                 let images = MeasurementImages {
                     measurement: Some(y.index_axis(Axis(0), 0).index_axis_move(Axis(0), 0)),
@@ -173,12 +175,6 @@ impl Studio<'_> {
         Ok(pngs)
     }
 
-    fn preview(&self, path: &Path, result: ArrayView4<'_, f32>) -> Result<(), WriteError> {
-        let small = (frames::longer_side(result) > PREVIEW_SIDE).then(|| frames::halved_to(result, PREVIEW_SIDE));
-        let shown = small.as_ref().map_or(result, |small| small.view());
-        write_atomically(path, |w| video::write_gif(w, shown, self.output.fps))
-    }
-
     fn piece(
         &self,
         path: &Path,
@@ -199,6 +195,12 @@ impl Studio<'_> {
         let pictures = Pictures::of(&images, frames, self.report_bytes).map_err(|e| WriteError::new(path, e))?;
         save(path, &pictures)
     }
+}
+
+fn preview(path: &Path, result: ArrayView4<'_, f32>, fps: u16) -> Result<(), WriteError> {
+    let small = (frames::longer_side(result) > PREVIEW_SIDE).then(|| frames::halved_to(result, PREVIEW_SIDE));
+    let shown = small.as_ref().map_or(result, |small| small.view());
+    write_atomically(path, |w| video::write_gif(w, shown, fps))
 }
 
 fn save(path: &Path, pictures: &Pictures) -> Result<(), WriteError> {

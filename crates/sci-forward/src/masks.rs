@@ -229,8 +229,19 @@ impl MaskStack {
     /// # Ok::<(), sci_forward::MaskError>(())
     /// ```
     pub fn reach(&self) -> f32 {
-        let of = |sign: f32| self.masks.mapv(|c| (sign * c).max(0.0)).sum_axis(ndarray::Axis(0));
-        [of(1.0), of(-1.0)].iter().flatten().copied().fold(0.0, f32::max)
+        let (frames, height, width) = self.masks.dim();
+        let mut sums = vec![[0f32; 2]; width];
+        let mut most = 0f32;
+        for row in 0..height {
+            sums.fill([0.0; 2]);
+            for frame in 0..frames {
+                for (sum, &c) in sums.iter_mut().zip(self.row(frame, row)) {
+                    *sum = [sum[0] + c.max(0.0), sum[1] + (-c).max(0.0)];
+                }
+            }
+            most = sums.as_flattened().iter().copied().fold(most, f32::max);
+        }
+        most
     }
 }
 

@@ -5,7 +5,7 @@
 
 use multiversion::multiversion;
 use ndarray::parallel::prelude::*;
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Zip, s};
+use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
 /// Peak signal-to-noise ratio `10 log10(1 / MSE)` in dB of an image `[H, W]` with data range 1; infinite for equal images.
 ///
@@ -116,28 +116,17 @@ pub fn ssim_gaussian(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>)
 }
 
 fn ssim_with(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>, taps: &[f64], covariance_norm: f64) -> f64 {
-    const C1: f64 = 0.01 * 0.01;
-    const C2: f64 = 0.03 * 0.03;
     assert_eq!(reference.dim(), image.dim(), "images of one size are compared");
     if reference.nrows() < taps.len() || reference.ncols() < taps.len() {
         return f64::NAN;
     }
     let (height, width) = (reference.nrows() + 1 - taps.len(), reference.ncols() + 1 - taps.len());
+    let mut strip = Strip::new(reference.ncols(), taps, covariance_norm);
     let mut sum = 0.0;
     for first in (0..height).step_by(STRIP) {
         let rows = s![first..(first + STRIP).min(height) + taps.len() - 1, ..];
-        let (a, b) = (reference.slice(rows).mapv(f64::from), image.slice(rows).mapv(f64::from));
-        let filter = |v: &Array2<f64>| filter_valid(v, taps);
-        let (mean_a, mean_b) = (filter(&a), filter(&b));
-        let (aa, bb, ab) = (filter(&(&a * &a)), filter(&(&b * &b)), filter(&(&a * &b)));
         // From strip to strip the terms are added in the order of the whole.
-        sum = Zip::from(&mean_a).and(&mean_b).and(&aa).and(&bb).and(&ab).fold(sum, |sum, &ma, &mb, &aa, &bb, &ab| {
-            let variance_a = covariance_norm * (aa - ma * ma);
-            let variance_b = covariance_norm * (bb - mb * mb);
-            let covariance = covariance_norm * (ab - ma * mb);
-            sum + (2.0 * ma * mb + C1) * (2.0 * covariance + C2)
-                / ((ma * ma + mb * mb + C1) * (variance_a + variance_b + C2))
-        });
+        sum = strip.terms(reference.slice(rows), image.slice(rows)).iter().fold(sum, |sum, term| sum + term);
     }
     sum / (height * width) as f64
 }
@@ -145,22 +134,101 @@ fn ssim_with(reference: ArrayView2<'_, f32>, image: ArrayView2<'_, f32>, taps: &
 /// Rows of the map of SSIM that are made at once: what they need stays in the cache.
 const STRIP: usize = 16;
 
-/// The separable filter `taps ⊗ taps` where it lies inside the image.
-fn filter_valid(image: &Array2<f64>, taps: &[f64]) -> Array2<f64> {
-    let (height, width) = (image.nrows() + 1 - taps.len(), image.ncols() + 1 - taps.len());
-    let mut rows = Array2::zeros((image.nrows(), width));
-    for (image, mut row) in image.outer_iter().zip(rows.outer_iter_mut()) {
-        for (k, &tap) in taps.iter().enumerate() {
-            row.scaled_add(tap, &image.slice(s![k..k + width]));
-        }
+/// Makes the map of SSIM a strip at a time, in the same memory.
+struct Strip<'t> {
+    taps: &'t [f64],
+    covariance_norm: f64,
+    width: usize,
+    /// The rows of both images.
+    images: [Vec<f64>; 2],
+    /// The product of two of them, and what the taps make of its rows.
+    product: Vec<f64>,
+    filtered: Vec<f64>,
+    /// Of a, b, a², b² and ab.
+    means: [Vec<f64>; 5],
+    terms: Vec<f64>,
+}
+
+impl<'t> Strip<'t> {
+    fn new(width: usize, taps: &'t [f64], covariance_norm: f64) -> Self {
+        let (images, means) = (std::array::from_fn(|_| Vec::new()), std::array::from_fn(|_| Vec::new()));
+        let (product, filtered, terms) = (Vec::new(), Vec::new(), Vec::new());
+        Self { taps, covariance_norm, width, images, product, filtered, means, terms }
     }
-    let mut filtered = Array2::zeros((height, width));
-    for (i, mut row) in filtered.outer_iter_mut().enumerate() {
-        for (k, &tap) in taps.iter().enumerate() {
-            row.scaled_add(tap, &rows.row(i + k));
+
+    /// The map of SSIM of these rows.
+    fn terms(&mut self, a: ArrayView2<'_, f32>, b: ArrayView2<'_, f32>) -> &[f64] {
+        let Self { taps, width, images, product, filtered, means, terms, .. } = self;
+        for (rows, image) in images.iter_mut().zip([a, b]) {
+            rows.clear();
+            rows.extend(image.iter().map(|&v| f64::from(v)));
         }
+        let mut filter = |rows: &[f64], to: &mut Vec<f64>| filter_valid(rows, *width, taps, filtered, to);
+        let [mean_a, mean_b, products @ ..] = means;
+        filter(&images[0], mean_a);
+        filter(&images[1], mean_b);
+        for ((a, b), to) in [(0, 0), (1, 1), (0, 1)].into_iter().zip(products) {
+            product.clear();
+            product.extend(images[a].iter().zip(&images[b]).map(|(a, b)| a * b));
+            filter(product, to);
+        }
+        terms.clear();
+        terms.resize(means[0].len(), 0.0);
+        let [mean_a, mean_b, aa, bb, ab] = &*means;
+        similarities(terms, [mean_a, mean_b, aa, bb, ab], self.covariance_norm);
+        terms
     }
-    filtered
+}
+
+/// The terms of [`ssim`], of the means of a, b, a², b² and ab.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn similarities(terms: &mut [f64], means: [&[f64]; 5], covariance_norm: f64) {
+    const C1: f64 = 0.01 * 0.01;
+    const C2: f64 = 0.03 * 0.03;
+    let [mean_a, mean_b, aa, bb, ab] = means.map(|mean| &mean[..terms.len()]);
+    for (i, term) in terms.iter_mut().enumerate() {
+        let (ma, mb) = (mean_a[i], mean_b[i]);
+        let variance_a = covariance_norm * (aa[i] - ma * ma);
+        let variance_b = covariance_norm * (bb[i] - mb * mb);
+        let covariance = covariance_norm * (ab[i] - ma * mb);
+        *term = (2.0 * ma * mb + C1) * (2.0 * covariance + C2)
+            / ((ma * ma + mb * mb + C1) * (variance_a + variance_b + C2));
+    }
+}
+
+/// The separable filter `taps ⊗ taps` of rows of this width, where it lies inside them; `rows` is scratch.
+fn filter_valid(image: &[f64], width: usize, taps: &[f64], rows: &mut Vec<f64>, to: &mut Vec<f64>) {
+    let inner = width + 1 - taps.len();
+    let height = image.len() / width;
+    rows.resize(height * inner, 0.0);
+    for (row, image) in rows.chunks_exact_mut(inner).zip(image.chunks_exact(width)) {
+        weighted_sums(row, image, 1, taps);
+    }
+    to.resize((height + 1 - taps.len()) * inner, 0.0);
+    for (i, row) in to.chunks_exact_mut(inner).enumerate() {
+        weighted_sums(row, &rows[i * inner..], inner, taps);
+    }
+}
+
+/// `to[j] = Σ_k taps[k] from[j + k step]`, added in this order.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn weighted_sums(to: &mut [f64], from: &[f64], step: usize, taps: &[f64]) {
+    const LANES: usize = 16;
+    let (to, rest) = to.as_chunks_mut::<LANES>();
+    for (i, to) in to.iter_mut().enumerate() {
+        let mut sums = [0f64; LANES];
+        for (k, &tap) in taps.iter().enumerate() {
+            let from = &from[i * LANES + k * step..][..LANES];
+            for lane in 0..LANES {
+                sums[lane] += tap * from[lane];
+            }
+        }
+        *to = sums;
+    }
+    let first = to.len() * LANES;
+    for (j, to) in rest.iter_mut().enumerate() {
+        *to = taps.iter().enumerate().fold(0.0, |sum, (k, &tap)| sum + tap * from[first + j + k * step]);
+    }
 }
 
 #[cfg(test)]

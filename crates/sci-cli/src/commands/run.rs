@@ -62,7 +62,7 @@ impl Args {
         check_folder(&out)?;
         refuse_inputs(&out, &experiment.inputs())?;
         catch_interrupts()?;
-        let (mut subject, chosen) = Subject::open(&experiment)?;
+        let (mut subject, chosen) = Subject::open(&experiment, &out)?;
         let own = shard.map_or(&*chosen, |shard| shard.part(&chosen));
         if let (Some(shard), []) = (shard, own) {
             outln!("shard {shard} has nothing to do: there are {} measurements", chosen.len());

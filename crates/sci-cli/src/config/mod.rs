@@ -34,9 +34,11 @@ pub use skip::Skip;
 pub use stage::Stage;
 
 /// What reading a gray scene and solving it take without the denoiser, measured.
-const SOLVING_GRAY: Footprint = Footprint { of_frame_pixel: 32, of_pixel: 16 };
+const SOLVING_GRAY: Footprint = Footprint { of_frame_pixel: 32, of_pixel: 16, of_frame: 0, fixed: 0 };
 /// The same of a color sensor, demosaicing included.
-const SOLVING_COLOR: Footprint = Footprint { of_frame_pixel: 64, of_pixel: 40 };
+const SOLVING_COLOR: Footprint = Footprint { of_frame_pixel: 64, of_pixel: 40, of_frame: 0, fixed: 0 };
+/// What each call of a solve that a gradient goes through takes for each pixel of each frame of a crop, measured.
+const LEARNING_THROUGH_A_CALL: usize = 200;
 
 /// An experiment ready to run.
 #[derive(Debug)]
@@ -361,11 +363,30 @@ impl Experiment {
         let solver = if is_color { SOLVING_COLOR } else { SOLVING_GRAY };
         // A network that demosaics is as large as the largest denoiser.
         let demosaicer = self.solver.demosaicer.as_ref().and_then(|d| d.weights());
-        let demosaicer = demosaicer.map(|_| Footprint { of_frame_pixel: 32, of_pixel: 1250 });
+        let demosaicer = demosaicer.map(|_| Footprint { of_frame_pixel: 32, of_pixel: 1250, ..Footprint::default() });
         let parts = self.denoisers.iter().map(|d| d.part.footprint(is_color)).chain(demosaicer);
-        parts.fold(solver, |most, part| Footprint {
-            of_frame_pixel: most.of_frame_pixel.max(solver.of_frame_pixel + part.of_frame_pixel),
-            of_pixel: most.of_pixel.max(solver.of_pixel + part.of_pixel),
+        // The allocator keeps much of what learning took, so that it adds to what solving takes.
+        parts.fold(
+            Footprint { of_frame_pixel: solver.of_frame_pixel, of_pixel: solver.of_pixel, ..self.learning() },
+            |most, part| Footprint {
+                of_frame_pixel: most.of_frame_pixel.max(solver.of_frame_pixel + part.of_frame_pixel),
+                of_pixel: most.of_pixel.max(solver.of_pixel + part.of_pixel),
+                ..most
+            },
+        )
+    }
+
+    /// What learning from crops takes: nothing of what the size of the scene decides.
+    fn learning(&self) -> Footprint {
+        let Some(AdaptLoss::Split(split)) = self.online.map(|online| online.adapt.loss) else {
+            return Footprint::default();
+        };
+        let pixels = split.crops * split.side.pow(2);
+        let networks = self.denoisers.iter().filter(|d| d.part.adapts()).map(|d| d.part.learning());
+        networks.fold(Footprint::default(), |most, network| Footprint {
+            of_frame: most.of_frame.max(pixels * (network.of_frame_pixel + split.calls * LEARNING_THROUGH_A_CALL)),
+            fixed: most.fixed.max(network.fixed + pixels * network.of_pixel),
+            ..most
         })
     }
 

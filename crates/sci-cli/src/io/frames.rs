@@ -213,7 +213,8 @@ pub fn png(frame: ArrayView3<'_, f32>) -> ImageResult<Vec<u8>> {
     let (channels, height, width) = frame.dim();
     let color = if channels == 1 { ExtendedColorType::L8 } else { ExtendedColorType::Rgb8 };
     let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive).write_image(
+    // One filter for all rows: to try all five for each takes longer than to pack them.
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Up).write_image(
         &to_pixels(frame),
         width as u32,
         height as u32,

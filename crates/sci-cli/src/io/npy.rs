@@ -5,7 +5,7 @@
 //!
 //! Source: the `.npy` format, versions 1.0 to 3.0, `numpy.lib.format`.
 
-use std::io::{Cursor, Read, Seek, Write};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 
 use ndarray::{ArrayViewD, Data, Dimension};
@@ -87,7 +87,8 @@ fn header_of(text: &str) -> Result<Header, ReadError> {
 pub(super) fn read_header(file: &mut impl Read) -> Result<(Header, u64), ReadError> {
     let mut bytes = vec![0; 12];
     file.read_exact(&mut bytes).map_err(ReadError::Io)?;
-    let missing = header_length(&bytes)?.end - bytes.len();
+    // A header may be said to end before.
+    let missing = header_length(&bytes)?.end.saturating_sub(bytes.len());
     file.take(missing as u64).read_to_end(&mut bytes).map_err(ReadError::Io)?;
     let (text, _) = split_header(&bytes)?;
     Ok((header_of(text)?, bytes.len() as u64))
@@ -232,14 +233,15 @@ fn to_row_major(samples: &Samples, shape: &[usize]) -> Samples {
     }
 }
 
-/// Reads the arrays named in `wanted` from an `.npz` (others are only listed).
+/// Reads the arrays named in `wanted` from an `.npz` (others are only listed), which need not be in memory.
 ///
 /// # Errors
 /// [`ReadError`] for a broken archive, a broken member, or one that would inflate beyond the file's budget.
-pub fn read_npz(bytes: &[u8], wanted: &[&str]) -> Result<NamedArrays, ReadError> {
+pub fn read_npz(mut file: impl Read + Seek, wanted: &[&str]) -> Result<NamedArrays, ReadError> {
     let broken = |e: &dyn std::fmt::Display| ReadError::Malformed { format: ".npz", reason: e.to_string() };
-    let mut budget = Budget::for_file(bytes.len());
-    let mut zip = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| broken(&e))?;
+    let length = file.seek(SeekFrom::End(0)).map_err(ReadError::Io)?;
+    let mut budget = Budget::for_file(usize::try_from(length).unwrap_or(usize::MAX));
+    let mut zip = zip::ZipArchive::new(file).map_err(|e| broken(&e))?;
     let mut found = NamedArrays::default();
     for index in 0..zip.len() {
         let member = zip.by_index(index).map_err(|e| broken(&e))?;
@@ -315,6 +317,8 @@ pub fn write_npz(w: impl Write + Seek, arrays: &[(&str, ArrayViewD<'_, f32>)]) -
 
 #[cfg(test)]
 mod tests {
+    use std::io::Cursor;
+
     use super::*;
     use ndarray::{Array3, ShapeBuilder};
 
@@ -367,7 +371,7 @@ mod tests {
         let mut bytes = Cursor::new(Vec::new());
         let (a, b) = (ramp().into_dyn(), ramp().into_dyn() * 2.0);
         write_npz(&mut bytes, &[("mask", a.view()), ("meas", b.view())]).unwrap();
-        let found = read_npz(bytes.get_ref(), &["meas"]).unwrap();
+        let found = read_npz(&mut bytes, &["meas"]).unwrap();
         assert_eq!(found.names, ["mask", "meas"]);
         assert_eq!(found.arrays["meas"].samples().at(23), 246.0);
         assert_eq!(found.arrays.len(), 1);
@@ -387,6 +391,8 @@ mod tests {
                 let _ = read_npy(&b);
             }
         }
+        let ends_at_once = [MAGIC, &[1, 0, 0, 0, 0, 0]].concat();
+        assert!(read_header(&mut ends_at_once.as_slice()).is_err());
         let mut forged = MAGIC.to_vec();
         forged.extend([1, 0, 70, 0]);
         forged
@@ -402,14 +408,14 @@ mod tests {
         let mut deflated = NpzWriter::new_compressed(Cursor::new(Vec::new()));
         deflated.add_array("mask", &ramp()).unwrap();
         for bytes in [plain.into_inner(), deflated.finish().unwrap().into_inner()] {
-            assert!(read_npz(&bytes, &["mask"]).is_ok());
+            assert!(read_npz(Cursor::new(&bytes), &["mask"]).is_ok());
             for len in 0..bytes.len() {
-                assert!(read_npz(&bytes[..len], &["mask"]).is_err(), "{len} bytes");
+                assert!(read_npz(Cursor::new(&bytes[..len]), &["mask"]).is_err(), "{len} bytes");
             }
             for at in 0..bytes.len() {
                 let mut b = bytes.clone();
                 b[at] ^= 0xff;
-                let _ = read_npz(&b, &["mask"]);
+                let _ = read_npz(Cursor::new(&b), &["mask"]);
             }
         }
     }
@@ -420,7 +426,7 @@ mod tests {
         let zeros = Array3::<f32>::zeros((20, 1024, 1024));
         npz.add_array("mask", &zeros).unwrap();
         let bytes = npz.finish().unwrap().into_inner();
-        match read_npz(&bytes, &["mask"]) {
+        match read_npz(Cursor::new(&bytes), &["mask"]) {
             Err(ReadError::TooLarge { needed, limit }) => {
                 assert_eq!(limit, Budget::for_file(bytes.len()).left());
                 assert!(needed > limit);
@@ -429,6 +435,6 @@ mod tests {
         }
         let mut stored = Cursor::new(Vec::new());
         write_npz(&mut stored, &[("mask", zeros.into_dyn().view())]).unwrap();
-        assert!(read_npz(stored.get_ref(), &["mask"]).is_ok(), "our own files are read whatever is in them");
+        assert!(read_npz(&mut stored, &["mask"]).is_ok(), "our own files are read whatever is in them");
     }
 }

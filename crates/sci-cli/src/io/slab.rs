@@ -1,13 +1,13 @@
 //! Owns the reading of a part of an array that is too large to be read whole: some frames, some rows.
 //!
-//! `.npy` files and the members of `.npz` archives that are stored plainly are sought in, packed members are unpacked from their
-//! beginning each time without being kept, and of HDF5 (MATLAB's v7.3 among it) the chunks are read that are needed. What other formats
-//! hold has to be read whole.
+//! `.npy` files and the members of `.npz` archives that are stored plainly are sought in, packed members are unpacked to disk first, and
+//! of HDF5 (MATLAB's v7.3 among it) the chunks are read that are needed. What other formats hold has to be read whole.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use super::npy::{self, Header};
 use super::samples::{Array, Budget, Samples};
@@ -28,6 +28,8 @@ enum Place {
     At(u64),
     /// A packed member of an archive.
     Packed(usize),
+    /// What was such a member, in a file that has no name and is gone with the last that reads it.
+    Unpacked(Arc<Mutex<File>>),
     /// A dataset.
     Dataset(String),
 }
@@ -140,13 +142,35 @@ impl Stored {
         self.header.stored.decoded_size()
     }
 
+    /// Makes a packed member of an archive one of which parts can be read: unpacks it to a file in `folder`.
+    ///
+    /// # Errors
+    /// The operating system's, and damaged data.
+    pub fn unpack(&mut self, folder: &Path) -> Result<(), FileError> {
+        let Place::Packed(index) = self.place else { return Ok(()) };
+        let error = |e| FileError::new(&self.path, e);
+        let broken = |e: zip::result::ZipError| error(ReadError::Malformed { format: ".npz", reason: e.to_string() });
+        let file = File::open(&self.path).map_err(|e| error(ReadError::Io(e)))?;
+        let mut zip = zip::ZipArchive::new(BufReader::new(file)).map_err(broken)?;
+        let mut member = zip.by_index(index).map_err(broken)?;
+        npy::read_header(&mut member).map_err(error)?;
+        let mut unpacked = tempfile::tempfile_in(folder).map_err(|e| FileError::new(folder, ReadError::Io(e)))?;
+        let wanted = self.header.bytes();
+        let found = io::copy(&mut member.take(wanted), &mut unpacked).map_err(|e| error(ReadError::Io(e)))?;
+        if found < wanted {
+            return Err(error(self.header.cut_short(found)));
+        }
+        self.place = Place::Unpacked(Arc::new(Mutex::new(unpacked)));
+        Ok(())
+    }
+
     /// The part of the array within a range of each axis.
     ///
     /// # Errors
     /// The operating system's, and damaged data.
     ///
     /// # Panics
-    /// If the ranges are not within the shape.
+    /// If the ranges are not within the shape, or it is packed: [`Stored::unpack`] comes first.
     pub fn read(&self, ranges: &[Range<usize>]) -> Result<Array, FileError> {
         assert_eq!(ranges.len(), self.header.shape.len(), "a range for each axis");
         let inside = |(range, &length): (&Range<usize>, &usize)| range.start <= range.end && range.end <= length;
@@ -155,99 +179,60 @@ impl Stored {
     }
 
     fn read_part(&self, ranges: &[Range<usize>]) -> Result<Array, ReadError> {
-        if let Place::Dataset(name) = &self.place {
-            return hdf5::read_part(&self.path, name, ranges);
-        }
-        let file = BufReader::with_capacity(1 << 20, File::open(&self.path).map_err(ReadError::Io)?);
-        let raw = match self.place {
-            Place::Packed(index) => {
-                let broken = |e: zip::result::ZipError| ReadError::Malformed { format: ".npz", reason: e.to_string() };
-                let mut zip = zip::ZipArchive::new(file).map_err(broken)?;
-                let mut member = zip.by_index(index).map_err(broken)?;
-                npy::read_header(&mut member)?;
-                self.picked(ranges, &mut Unpacked(member))
-            }
-            Place::At(start) => {
-                let mut file = file;
-                file.seek(SeekFrom::Start(start)).map_err(ReadError::Io)?;
-                self.picked(ranges, &mut Sought(file))
-            }
-            Place::Dataset(_) => unreachable!("read above"),
+        let raw = match &self.place {
+            Place::Dataset(name) => return hdf5::read_part(&self.path, name, ranges),
+            Place::At(start) => File::open(&self.path).and_then(|file| self.picked(ranges, *start, file)),
+            // Whoever held it last reads from a place of his own.
+            Place::Unpacked(file) => self.picked(ranges, 0, &mut *file.lock().unwrap_or_else(PoisonError::into_inner)),
+            Place::Packed(_) => panic!("a packed member is unpacked before it is read"),
         };
         let shape = ranges.iter().map(ExactSizeIterator::len).collect();
         // What is asked for is what memory there is for.
         self.header.decode(shape, raw.map_err(ReadError::Io)?, &mut Budget::for_file(usize::MAX))
     }
 
-    /// The bytes of a part, in the order of the file.
-    fn picked(&self, ranges: &[Range<usize>], from: &mut impl Forward) -> io::Result<Vec<u8>> {
+    /// The bytes of a part, in the order of the file, in which the array begins at `start`.
+    fn picked(&self, ranges: &[Range<usize>], start: u64, file: impl Read + Seek) -> io::Result<Vec<u8>> {
         let mut axes: Vec<(usize, Range<usize>)> =
             self.header.shape.iter().copied().zip(ranges.iter().cloned()).collect();
         if self.header.fortran {
             axes.reverse();
         }
-        let mut raw =
-            Vec::with_capacity(self.header.sample() * ranges.iter().map(ExactSizeIterator::len).product::<usize>());
+        let mut file = BufReader::with_capacity(1 << 20, file);
+        file.seek(SeekFrom::Start(start))?;
+        let size = self.header.sample();
+        let mut raw = Vec::with_capacity(size * ranges.iter().map(ExactSizeIterator::len).product::<usize>());
         let mut at = 0;
         for run in runs(&axes) {
-            let (start, length) = ((run.start * self.header.sample()) as u64, run.len() * self.header.sample());
-            from.skip(start - at)?;
+            let (start, length) = (run.start * size, run.len() * size);
+            // Keeps what the buffer holds.
+            file.seek_relative((start - at) as i64)?;
             let old = raw.len();
             raw.resize(old + length, 0);
-            from.read_exact(&mut raw[old..])?;
-            at = start + length as u64;
+            file.read_exact(&mut raw[old..])?;
+            at = start + length;
         }
         Ok(raw)
     }
 }
 
 /// The runs of neighbouring samples of a part, in their order; an axis is its length and the range that is wanted.
-fn runs(axes: &[(usize, Range<usize>)]) -> Vec<Range<usize>> {
+fn runs(axes: &[(usize, Range<usize>)]) -> impl Iterator<Item = Range<usize>> {
     // Axes after the last that is not wanted whole are read in one go.
     let last = axes.iter().rposition(|(length, range)| range.len() != *length).unwrap_or(0);
     let inner: usize = axes.iter().skip(last + 1).map(|(length, _)| length).product();
-    let mut starts = vec![0];
-    for (length, range) in &axes[..last.min(axes.len())] {
-        starts = starts.iter().flat_map(|start| range.clone().map(move |i| start * length + i)).collect();
-    }
+    let outer = &axes[..last.min(axes.len())];
     let whole = (1, 0..1);
-    let (length, range) = axes.get(last).unwrap_or(&whole);
-    starts.iter().map(|start| (start * length + range.start) * inner..(start * length + range.end) * inner).collect()
-}
-
-/// What is read from front to back, some of it passed over.
-trait Forward: Read {
-    fn skip(&mut self, bytes: u64) -> io::Result<()>;
-}
-
-struct Sought(BufReader<File>);
-
-impl Read for Sought {
-    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
-        self.0.read(into)
-    }
-}
-
-impl Forward for Sought {
-    fn skip(&mut self, bytes: u64) -> io::Result<()> {
-        // Keeps what the buffer holds.
-        self.0.seek_relative(i64::try_from(bytes).map_err(io::Error::other)?)
-    }
-}
-
-struct Unpacked<R>(R);
-
-impl<R: Read> Read for Unpacked<R> {
-    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
-        self.0.read(into)
-    }
-}
-
-impl<R: Read> Forward for Unpacked<R> {
-    fn skip(&mut self, bytes: u64) -> io::Result<()> {
-        let skipped = io::copy(&mut self.0.by_ref().take(bytes), &mut io::sink())?;
-        if skipped == bytes { Ok(()) } else { Err(io::ErrorKind::UnexpectedEof.into()) }
-    }
+    let (length, range) = axes.get(last).cloned().unwrap_or(whole);
+    let count: usize = outer.iter().map(|(_, range)| range.len()).product();
+    (0..count).map(move |mut run| {
+        let (mut place, mut stride) = (0, 1);
+        for (length, range) in outer.iter().rev() {
+            place += (range.start + run % range.len()) * stride;
+            (run, stride) = (run / range.len(), stride * length);
+        }
+        (place * length + range.start) * inner..(place * length + range.end) * inner
+    })
 }
 
 impl Samples {
@@ -255,7 +240,7 @@ impl Samples {
     #[cfg(test)]
     fn part(&self, shape: &[usize], ranges: &[Range<usize>]) -> Vec<f32> {
         let axes: Vec<_> = shape.iter().copied().zip(ranges.iter().cloned()).collect();
-        runs(&axes).into_iter().flatten().map(|i| self.at(i)).collect()
+        runs(&axes).flatten().map(|i| self.at(i)).collect()
     }
 }
 
@@ -273,7 +258,9 @@ mod tests {
         ramp().slice(s![1..3, 2..5, ..]).iter().copied().collect()
     }
 
-    fn check(stored: &Stored) {
+    fn check(stored: &Stored, folder: &Path) {
+        let mut stored = stored.clone();
+        stored.unpack(folder).unwrap();
         assert_eq!(stored.shape(), [4, 5, 6]);
         let part = stored.read(&[1..3, 2..5, 0..6]).unwrap();
         assert_eq!((part.shape(), part.samples()), (&[2, 3, 6][..], &Samples::Floats(expected())));
@@ -289,7 +276,7 @@ mod tests {
         for (name, array) in [("c.npy", ramp()), ("fortran.npy", fortran.clone())] {
             let path = dir.path().join(name);
             array.write_npy(File::create(&path).unwrap()).unwrap();
-            check(&arrays(&path).unwrap().unwrap().named[0].1);
+            check(&arrays(&path).unwrap().unwrap().named[0].1, dir.path());
         }
         let path = dir.path().join("a.npz");
         for packed in [false, true] {
@@ -300,7 +287,8 @@ mod tests {
             npz.finish().unwrap();
             let found = arrays(&path).unwrap().unwrap().named;
             assert_eq!(found.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), ["other", "mask"]);
-            check(&found[1].1);
+            check(&found[1].1, dir.path());
+            assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 3, "nothing is left of what was unpacked");
         }
         let found = arrays(dir.path()).unwrap().unwrap().named;
         assert_eq!(found.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), ["c", "fortran"]);

@@ -33,7 +33,11 @@ impl Part for Fastdvdnet {
 
     fn footprint(&self, is_color: bool) -> Footprint {
         let (of_frame_pixel, of_pixel) = if is_color { (32, 1250) } else { (8, 1250) };
-        Footprint { of_frame_pixel, of_pixel }
+        Footprint { of_frame_pixel, of_pixel, ..Footprint::default() }
+    }
+
+    fn learning(&self) -> Footprint {
+        Footprint { of_frame_pixel: 3850, of_pixel: 6700, fixed: 100 << 20, ..Footprint::default() }
     }
 
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

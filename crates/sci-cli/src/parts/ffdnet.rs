@@ -26,7 +26,11 @@ impl Part for Ffdnet {
 
     fn footprint(&self, is_color: bool) -> Footprint {
         let (of_frame_pixel, of_pixel) = if is_color { (8, 280) } else { (0, 200) };
-        Footprint { of_frame_pixel, of_pixel }
+        Footprint { of_frame_pixel, of_pixel, ..Footprint::default() }
+    }
+
+    fn learning(&self) -> Footprint {
+        Footprint { of_frame_pixel: 1100, fixed: 45 << 20, ..Footprint::default() }
     }
 
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

@@ -90,6 +90,11 @@ pub trait Part: Debug + Send + Sync {
         Footprint::default()
     }
 
+    /// What it takes on top while it learns from a crop of a scene, whose pixels and frames these are; measured.
+    fn learning(&self) -> Footprint {
+        Footprint::default()
+    }
+
     /// What all measurements share of it, such as a loaded network.
     ///
     /// # Errors

@@ -11,6 +11,9 @@ use sci_forward::Measurement;
 
 use super::Inference;
 
+/// Sides of frames that no network has to continue: they work at an eighth of the size at least.
+const MULTIPLE: usize = 8;
+
 /// What networks did and were spared in a solve.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Work {
@@ -73,7 +76,7 @@ impl Saving {
         };
         denoiser = Box::new(Counted { inner: denoiser, multiply_adds, count: self.multiply_adds.clone() });
         if inference.flips {
-            denoiser = Box::new(Flips::new(denoiser));
+            denoiser = Box::new(Flips::new(denoiser).continued_to(MULTIPLE));
         }
         if inference.dim != 1.0 {
             denoiser = Box::new(Dimmed::new(denoiser, inference.dim));

@@ -26,7 +26,11 @@ impl Part for Shiftnet {
 
     fn footprint(&self, is_color: bool) -> Footprint {
         let (of_frame_pixel, of_pixel) = if is_color { (80, 400) } else { (48, 320) };
-        Footprint { of_frame_pixel, of_pixel }
+        Footprint { of_frame_pixel, of_pixel, ..Footprint::default() }
+    }
+
+    fn learning(&self) -> Footprint {
+        Footprint { of_frame_pixel: 1850, fixed: 25 << 20, ..Footprint::default() }
     }
 
     fn build(&self, site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

@@ -21,7 +21,7 @@ fn read(t: &mut Table<'_>) -> Box<dyn Part> {
 
 impl Part for Threshold {
     fn footprint(&self, _is_color: bool) -> Footprint {
-        Footprint { of_frame_pixel: 0, of_pixel: 180 }
+        Footprint { of_pixel: 180, ..Footprint::default() }
     }
 
     fn build(&self, _site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

@@ -37,7 +37,7 @@ impl Part for LowRank {
 
     /// Sums and weights of all patches, and the groups of one frame.
     fn footprint(&self, _is_color: bool) -> Footprint {
-        Footprint { of_frame_pixel: 16, of_pixel: 400 }
+        Footprint { of_frame_pixel: 16, of_pixel: 400, ..Footprint::default() }
     }
 
     fn build(&self, _site: &Site<'_>) -> anyhow::Result<Box<dyn Built>> {

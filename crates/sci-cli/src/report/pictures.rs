@@ -3,12 +3,13 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::ImageError;
-use ndarray::{Array4, ArrayView2, ArrayView3, ArrayView4, Axis, Zip, s};
+use ndarray::{Array4, ArrayView2, ArrayView3, ArrayView4, Axis, s};
 use rayon::prelude::*;
 use sci_forward::CfaPattern;
 use serde::Serialize;
 
 use crate::io::frames::{self, halved_to, longer_side, pngs};
+use crate::solve::psnr_rgb;
 
 /// Frames are not made smaller than this, in pixels of the longer side, but left out.
 const SMALLEST: usize = 400;
@@ -131,8 +132,8 @@ fn to_its_largest(y: ArrayView2<'_, f32>) -> Array4<f32> {
 
 /// PSNR over all channels of a frame `[C, H, W]`; `None` (so that JSON has a form for it) where it is infinite.
 pub(crate) fn psnr(truth: ArrayView3<'_, f32>, frame: ArrayView3<'_, f32>) -> Option<f64> {
-    let sum = Zip::from(truth).and(frame).fold(0.0, |s, &a, &b| s + (f64::from(a) - f64::from(b)).powi(2));
-    Some(-10.0 * (sum / truth.len() as f64).log10()).filter(|p| p.is_finite())
+    let one = |frame| ArrayView3::insert_axis(frame, Axis(0));
+    Some(psnr_rgb(one(truth), one(frame))).filter(|p| p.is_finite())
 }
 
 const SCHEME: &str = "data:image/png;base64,";

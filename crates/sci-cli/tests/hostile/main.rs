@@ -18,7 +18,7 @@ use nets::{Architecture, Ends, Layers, WeightFile};
 use sci_cli::config;
 use sci_cli::io::mat::{self, Variable};
 use sci_cli::io::samples::Budget;
-use sci_cli::io::scene::{self, Reading};
+use sci_cli::io::scene::{self, Banded, Reading};
 use sci_cli::io::{frames, hdf5, npy, tiff, video};
 use sci_cli::record::Record;
 use sci_cli::table::Source;
@@ -135,6 +135,26 @@ fn is_scene(path: &Path, bytes: &[u8]) -> bool {
     scene::read(path, &Reading::default()).is_ok()
 }
 
+/// A scene that is read in bands, by way of a file: all that is read of a measurement.
+fn is_banded(path: &Path, bytes: &[u8]) -> bool {
+    std::fs::write(path, bytes).unwrap();
+    // Of a folder the file is the masks, beside others of its arrays.
+    let folder = path.parent().unwrap();
+    let scene = if path.extension().is_some_and(|e| e == "npy") { folder } else { path };
+    read_in_bands(scene, folder).is_some()
+}
+
+fn read_in_bands(path: &Path, folder: &Path) -> Option<()> {
+    let mut scene = Banded::open(path, &Reading::default()).ok()??;
+    scene.unpack(folder).ok()?;
+    scene.decide(2).ok()?;
+    let (last, rows) = (scene.len() - 1, scene.shape().height.min(2));
+    scene.checksum(&[last]).ok()?;
+    scene.band(last, 0..rows).ok()?;
+    scene.truth_frame(last, 0).ok()?;
+    scene.y(last).ok().map(drop)
+}
+
 /// One test, as the largest allocation is the whole process's.
 #[test]
 fn damaged_files_are_harmless() {
@@ -183,9 +203,9 @@ fn damaged_files_are_harmless() {
 
     let mut zip = Cursor::new(Vec::new());
     npy::write_npz(&mut zip, &[("mask", ramp.view().into_dyn())]).unwrap();
-    check(".npz", zip.get_ref(), |b| npy::read_npz(b, &["mask"]).is_ok());
+    check(".npz", zip.get_ref(), |b| npy::read_npz(Cursor::new(b), &["mask"]).is_ok());
     let packed = compressed(&[("mask", ramp.view().into_dyn())]);
-    check(".npz, compressed", &packed, |b| npy::read_npz(b, &["mask"]).is_ok());
+    check(".npz, compressed", &packed, |b| npy::read_npz(Cursor::new(b), &["mask"]).is_ok());
 
     let mut gif = Vec::new();
     video::write_gif(&mut gif, Array4::from_elem((3, 1, 9, 11), 0.4).view(), 10).unwrap();
@@ -223,6 +243,7 @@ fn damaged_files_are_harmless() {
     check("training file, iterates", include_bytes!("../../../../configs/train/fastdvdnet_gray_sci.toml"), is_training);
     check_within(json_budget, "record.json", include_bytes!("../../../../tests/fixtures/record.json"), is_record);
     damaged_scenes(&dir.path().join("scene"), &ramp);
+    damaged_bands(dir.path(), &ramp);
     damaged_weights(dir.path());
     attacks(dir.path());
 }
@@ -239,6 +260,39 @@ fn damaged_scenes(path: &Path, ramp: &Array3<f32>) {
     let packed = compressed(&[("mask", mask.view().into_dyn()), ("meas", meas.view().into_dyn())]);
     check("scene, .npz", &packed, |b| is_scene(path, b));
     check("scene, .mat v7", include_bytes!("../../../../tests/fixtures/scene_v7.mat"), |b| is_scene(path, b));
+}
+
+/// Every format of which parts are read, with the truth or the measurements.
+fn damaged_bands(folder: &Path, ramp: &Array3<f32>) {
+    let (mask, meas) = (ramp.mapv(|v| v.min(1.0)), ramp.sum_axis(ndarray::Axis(0)));
+    let orig = Array3::from_shape_fn((4, 5, 7), |(t, y, x)| (20 * t + 5 * y + x) as f32 / 255.0);
+    let of = |array: &Array3<f32>| array.iter().copied().collect::<Vec<f32>>();
+    let path = folder.join("bands");
+    let arrays = [("mask", mask.view().into_dyn()), ("orig", orig.view().into_dyn())];
+    let mut plain = Cursor::new(Vec::new());
+    npy::write_npz(&mut plain, &arrays).unwrap();
+    check("bands, .npz", plain.get_ref(), |b| is_banded(&path, b));
+    check("bands, .npz, compressed", &compressed(&arrays), |b| is_banded(&path, b));
+
+    let mut hdf5 = hdf5_pure::FileBuilder::new();
+    hdf5.create_dataset("mask")
+        .with_f32_data(&of(&mask))
+        .with_shape(&[2, 5, 7])
+        .with_chunks(&[1, 2, 7])
+        .with_deflate(6);
+    hdf5.create_dataset("orig").with_u8_data(&[7; 140]).with_shape(&[4, 5, 7]).with_chunks(&[2, 2, 4]).with_deflate(6);
+    check("bands, .h5", &hdf5.finish().unwrap(), |b| is_banded(&path, b));
+    let mut matlab = hdf5_pure::mat::MatBuilder::new(hdf5_pure::mat::Options::default());
+    matlab.write_f32("mask", &[7, 5, 2], &of(&mask)).unwrap();
+    matlab.write_f64("meas", &[7, 5], &meas.iter().map(|&y| f64::from(y)).collect::<Vec<_>>()).unwrap();
+    check("bands, .mat v7.3", &matlab.finish().unwrap(), |b| is_banded(&path, b));
+
+    let arrays = folder.join("arrays");
+    std::fs::create_dir(&arrays).unwrap();
+    npy::write_npy(&mut std::fs::File::create(arrays.join("orig.npy")).unwrap(), &orig).unwrap();
+    let mut bytes = Vec::new();
+    npy::write_npy(&mut bytes, &mask).unwrap();
+    check("bands, .npy", &bytes, |b| is_banded(&arrays.join("mask.npy"), b));
 }
 
 fn damaged_weights(folder: &Path) {
@@ -307,10 +361,21 @@ fn attacks(folder: &Path) {
         let header =
             format!("{{'descr': '|u1', 'fortran_order': {order}, 'shape': (0, 1099511627776, 1099511627776)}}\n");
         refused("an empty scene of huge frames", &npz(&header, &[]), |b| is_scene(&scene, b));
+        refused("an empty scene of huge frames, in bands", &npz(&header, &[]), |b| is_banded(&scene, b));
+        // The sizes in the directory of the archive say that 4 GiB are packed in it.
+        let header = format!("{{'descr': '|u1', 'fortran_order': {order}, 'shape': (1, 65535, 65535)}}\n");
+        let mut forged = npz(&header, &[1; 4096]);
+        for at in (0..forged.len() - 4).filter(|&at| forged[at..at + 4] == *b"PK\x01\x02").collect::<Vec<_>>() {
+            forged[at + 24..at + 28].copy_from_slice(&0xffff_fff0u32.to_le_bytes());
+        }
+        refused("an archive that says that it holds more, in bands", &forged, |b| is_banded(&scene, b));
+        refused("an archive that says that it holds more", &forged, |b| is_scene(&scene, b));
     }
     let zeros = "{'descr': '<f8', 'fortran_order': False, 'shape': (7864320,)}\n";
     // 60 MiB in some kilobytes, of which 30 would be left: as doubles and as floats it is too much.
-    refused("zeros that unpack", &npz(zeros, &vec![0; 60 << 20]), |b| npy::read_npz(b, &["mask", "meas"]).is_ok());
+    refused("zeros that unpack", &npz(zeros, &vec![0; 60 << 20]), |b| {
+        npy::read_npz(Cursor::new(b), &["mask", "meas"]).is_ok()
+    });
 
     let deep = |open: &str| format!("a = {}", open.repeat(300_000));
     for open in ["[", "{b=", "[{b="] {

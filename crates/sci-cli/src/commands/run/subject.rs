@@ -1,5 +1,7 @@
 //! What a run solves: a scene in memory, or one that is too large for it.
 
+use std::path::Path;
+
 use anyhow::Context;
 use sci_forward::{CfaPattern, VideoShape};
 
@@ -21,12 +23,12 @@ pub(super) enum Subject {
 }
 
 impl Subject {
-    /// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted.
+    /// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted; `out` is where the results will be.
     ///
     /// # Errors
     /// Those of reading it; and if it has to be solved in bands for `memory` but cannot be.
-    pub(super) fn open(experiment: &Experiment) -> anyhow::Result<(Self, Vec<usize>)> {
-        let subject = match Self::cut(experiment)? {
+    pub(super) fn open(experiment: &Experiment, out: &Path) -> anyhow::Result<(Self, Vec<usize>)> {
+        let subject = match Self::cut(experiment, out)? {
             Some(cut) => Self::Cut(Box::new(cut)),
             None => Self::Whole(Box::new(Self::whole(experiment)?)),
         };
@@ -55,7 +57,7 @@ impl Subject {
     }
 
     /// The bands of a scene that does not fit into memory, if it can be read in bands.
-    fn cut(experiment: &Experiment) -> anyhow::Result<Option<Cut>> {
+    fn cut(experiment: &Experiment, out: &Path) -> anyhow::Result<Option<Cut>> {
         let (path, reading) = (&experiment.data.path, &experiment.data.reading);
         let Some(memory) = experiment.memory.filter(|_| experiment.needs_whole().is_none()) else { return Ok(None) };
         let Some(mut scene) = Banded::open(path, reading).context("data.path")? else { return Ok(None) };
@@ -69,6 +71,9 @@ impl Subject {
         if bands.is_whole() {
             return Ok(None);
         }
+        // Where the results will be there is room for what they are made of.
+        let beside = out.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("."));
+        scene.unpack(beside).context("data.path")?;
         scene.decide(bands.solved(bands.middle()).len()).context("data.path")?;
         Ok(Some(Cut { scene, bands, memory }))
     }
@@ -111,21 +116,19 @@ impl Subject {
         }
     }
 
-    /// A checksum of the measurements: of all, or of those `chosen` of a scene that is read in bands.
+    /// A checksum of the data: of all measurements, or of what those `chosen` of a scene that is read in bands are made of.
     ///
     /// # Errors
     /// If they cannot be read.
     pub(super) fn checksum(&self, chosen: &[usize]) -> Result<u32, SceneError> {
-        let mut sum = crc32fast::Hasher::new();
         match self {
-            Self::Whole(scene) => scene.measurements.iter().for_each(|y| sum.update(&y.to_le_bytes())),
-            Self::Cut(cut) => {
-                for &k in chosen {
-                    cut.scene.y(k)?.iter().for_each(|y| sum.update(&y.to_le_bytes()));
-                }
+            Self::Whole(scene) => {
+                let mut sum = crc32fast::Hasher::new();
+                scene.measurements.iter().for_each(|y| sum.update(&y.to_le_bytes()));
+                Ok(sum.finalize())
             }
+            Self::Cut(cut) => cut.scene.checksum(chosen),
         }
-        Ok(sum.finalize())
     }
 }
 

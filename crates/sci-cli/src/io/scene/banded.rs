@@ -11,7 +11,7 @@ use super::read::{Parts, assembled};
 use super::source::Source;
 use super::{Keys, Reading, Scene, SceneError, Truth, names};
 use crate::io::Format;
-use crate::io::samples::Array;
+use crate::io::samples::{Array, Samples};
 use crate::io::slab::{self, Stored};
 
 /// A scene of which a band of rows is in memory at a time.
@@ -65,7 +65,7 @@ impl Part {
 }
 
 impl Banded {
-    /// Looks at a scene; nothing of one whose format has to be read whole. [`Banded::decide`] comes next.
+    /// Looks at a scene; nothing of one whose format has to be read whole. [`Banded::unpack`] and [`Banded::decide`] come next.
     ///
     /// # Errors
     /// [`SceneError`] naming the file and what is wrong with it.
@@ -129,12 +129,21 @@ impl Banded {
         Ok(Some(Self { file, reading, mask, meas, truth, shape, count, cfa, unit: 1.0, warnings }))
     }
 
+    /// Unpacks what is packed to files in `folder` that have no names, and are gone with the scene.
+    ///
+    /// # Errors
+    /// [`SceneError`] naming the file and what is wrong with it.
+    pub fn unpack(&mut self, folder: &Path) -> Result<(), SceneError> {
+        let parts = [Some(&mut self.mask), self.meas.as_mut(), self.truth.as_mut()];
+        parts.into_iter().flatten().try_for_each(|part| Ok(part.stored.unpack(folder)?))
+    }
+
     /// Decides by `rows` rows in the middle of the first measurement what the numbers mean.
     ///
     /// # Errors
     /// Those of reading them, and if they tell a white that does not go with the truth.
     pub fn decide(&mut self, rows: usize) -> Result<(), SceneError> {
-        let (height, rows) = (self.shape.height, rows.min(self.shape.height).max(2));
+        let (height, rows) = (self.shape.height, rows.max(2).min(self.shape.height));
         let first = (height - rows) / 2 / 2 * 2;
         let part = self.band(0, first..first + rows)?;
         if part.unit != 1.0 && self.truth.is_some() {
@@ -218,19 +227,51 @@ impl Banded {
     /// # Panics
     /// If there is no such measurement.
     pub fn y(&self, k: usize) -> Result<Array2<f32>, SceneError> {
-        const ROWS: usize = 64;
-        let height = self.shape.height;
         if let Some(part) = &self.meas {
             let decided = self.reading.decided.unwrap_or_default();
-            let stored = self.place(part).frames(&part.read(k..k + 1, 0..height)?, 1.0)?;
+            let stored = self.place(part).frames(&part.read(k..k + 1, 0..self.shape.height)?, 1.0)?;
             let black = self.reading.sensor.black;
             return Ok(stored.index_axis_move(Axis(0), 0).mapv(|y| (y - black) / decided.meas / decided.unit));
         }
-        let rows = |first: usize| first..(first + ROWS).min(height);
-        let strips = (0..height).step_by(ROWS).map(|first| Ok(self.band(k, rows(first))?.y(0).to_owned()));
+        let strips = self.strips().map(|rows| Ok(self.band(k, rows)?.y(0).to_owned()));
         let strips = strips.collect::<Result<Vec<Array2<f32>>, SceneError>>()?;
         let views: Vec<_> = strips.iter().map(|strip| strip.view()).collect();
         Ok(concatenate(Axis(0), &views).expect("strips of one width"))
+    }
+
+    /// All rows, few at a time.
+    fn strips(&self) -> impl Iterator<Item = Range<usize>> {
+        const ROWS: usize = 64;
+        let height = self.shape.height;
+        (0..height).step_by(ROWS).map(move |first| first..(first + ROWS).min(height))
+    }
+
+    /// A checksum of measurements: of y, or, where y is simulated, of the masks and the truth as they are stored, which is less work.
+    ///
+    /// # Errors
+    /// As [`Banded::band`].
+    ///
+    /// # Panics
+    /// If there is no such measurement.
+    pub fn checksum(&self, measurements: &[usize]) -> Result<u32, SceneError> {
+        let mut sum = crc32fast::Hasher::new();
+        let mut add = |array: &Array| match array.samples() {
+            Samples::Bytes(bytes) => sum.update(bytes),
+            Samples::Floats(values) => sum.update(&values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()),
+        };
+        for rows in self.strips().filter(|_| self.meas.is_none()) {
+            add(&self.mask.read(0..self.shape.frames, rows)?);
+        }
+        for &k in measurements {
+            let (part, frames) = match &self.meas {
+                Some(meas) => (meas, k..k + 1),
+                None => self.frames_of(k).expect("what is simulated has a truth"),
+            };
+            for rows in self.strips() {
+                add(&part.read(frames.clone(), rows)?);
+            }
+        }
+        Ok(sum.finalize())
     }
 }
 
@@ -256,6 +297,7 @@ mod tests {
     fn bands_hold_what_the_whole_has_in_their_rows() {
         let (_dir, path) = scene([2, 40, 6], 5);
         let mut banded = Banded::open(&path, &Reading::default()).unwrap().unwrap();
+        banded.unpack(path.parent().unwrap()).unwrap();
         banded.decide(20).unwrap();
         let whole = super::super::read(&path, &Reading::default()).unwrap();
         assert_eq!((banded.len(), banded.shape(), banded.unit), (2, whole.operator.shape(), 1.0));
@@ -263,6 +305,8 @@ mod tests {
         assert_eq!(band.y(0), whole.y(1).slice(ndarray::s![10..30, ..]));
         assert_eq!(band.truth_of(0).unwrap(), whole.truth_of(1).unwrap().slice(ndarray::s![.., 10..30, ..]));
         assert_eq!(banded.y(1).unwrap(), whole.y(1));
+        let sums = [&[0][..], &[1], &[0, 1]].map(|chosen| banded.checksum(chosen).unwrap());
+        assert!(sums[0] != sums[1] && sums[1] != sums[2] && sums[0] != sums[2], "{sums:?}");
         let (frame, color) = banded.truth_frame(1, 1).unwrap().unwrap().seen(None);
         assert_eq!((frame.index_axis(Axis(0), 0), color), (whole.truth_of(1).unwrap().index_axis(Axis(0), 1), None));
     }

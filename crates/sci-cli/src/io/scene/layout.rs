@@ -1,6 +1,6 @@
 //! Owns the step from an array as stored to frames in the program's layout and unit.
 
-use ndarray::{Array3, Array4, ArrayD, Axis, Ix3, Ix4, IxDyn};
+use ndarray::{Array3, Array4, ArrayView, ArrayView3, ArrayView4, ArrayViewD, Axis, Dimension, Ix3, Ix4, IxDyn, Zip};
 
 use super::{Axes, SceneError};
 use crate::io::Format;
@@ -60,19 +60,14 @@ impl Place<'_> {
         SceneError::Axes { file: self.file.into(), key: self.key.into(), shape: shape.to_vec(), expected }
     }
 
-    /// As `f32`, divided by white, in the order of axes that the file means.
-    fn values(&self, array: &Array, white: f32) -> ArrayD<f32> {
-        let shape = IxDyn(array.shape());
-        let values = match array.samples() {
-            Samples::Bytes(v) => v.iter().map(|&b| f32::from(b) / white).collect(),
-            Samples::Floats(v) => v.iter().map(|&x| x / white).collect::<Vec<_>>(),
-        };
-        let data = ArrayD::from_shape_vec(shape, values).expect("an Array's shape holds exactly its samples");
+    /// Samples in the order of axes that the file means.
+    fn laid_out<'v, T>(&self, shape: &[usize], samples: &'v [T]) -> ArrayViewD<'v, T> {
+        let data = ArrayViewD::from_shape(IxDyn(shape), samples).expect("an Array's shape holds exactly its samples");
         if self.format == Format::Mat { data.reversed_axes() } else { data }
     }
 
     /// Leaves out axes of length 1, the outermost first, until `most` are left or all others are longer.
-    fn squeezed(&self, mut data: ArrayD<f32>, most: usize) -> ArrayD<f32> {
+    fn squeezed<'v, T>(&self, mut data: ArrayViewD<'v, T>, most: usize) -> ArrayViewD<'v, T> {
         while data.ndim() > most {
             let mut ones = (0..data.ndim()).filter(|&axis| data.len_of(Axis(axis)) == 1);
             let outermost = if self.axes() == Axes::Thw { ones.next() } else { ones.next_back() };
@@ -84,7 +79,7 @@ impl Place<'_> {
         data
     }
 
-    fn three(&self, data: ArrayD<f32>) -> Result<Array3<f32>, SceneError> {
+    fn three<'v, T>(&self, data: ArrayViewD<'v, T>) -> Result<ArrayView3<'v, T>, SceneError> {
         const EXPECTED: &str = "two axes (one frame) or three, none of length 0, and any number of length 1";
         let shape = data.shape().to_vec();
         let data = self.squeezed(data, 3);
@@ -97,26 +92,10 @@ impl Place<'_> {
             (3, Axes::Hwt) => data.permuted_axes(IxDyn(&[2, 0, 1])),
             _ => return Err(self.wrong(&shape, EXPECTED)),
         };
-        let data = data.into_dimensionality::<Ix3>().map_err(|_| self.wrong(&shape, EXPECTED))?;
-        Ok(data.as_standard_layout().into_owned())
+        data.into_dimensionality::<Ix3>().map_err(|_| self.wrong(&shape, EXPECTED))
     }
 
-    /// Gray frames `[T, H, W]`; pictures may be color if all channels are equal.
-    pub(super) fn frames(&self, array: &Array, white: f32) -> Result<Array3<f32>, SceneError> {
-        if !self.is_picture() || array.shape().len() != 4 {
-            return self.three(self.values(array, white));
-        }
-        let pictures = self.channels(array, white)?;
-        let first = pictures.index_axis(Axis(1), 0);
-        if pictures.axis_iter(Axis(1)).any(|channel| channel != first) {
-            return Err(SceneError::Color { file: self.file.into(), key: self.key.into() });
-        }
-        Ok(first.to_owned())
-    }
-
-    /// A video `[T, C, H, W]`, C = 1 or 3.
-    pub(super) fn channels(&self, array: &Array, white: f32) -> Result<Array4<f32>, SceneError> {
-        let data = self.values(array, white);
+    fn four<'v, T>(&self, data: ArrayViewD<'v, T>) -> Result<ArrayView4<'v, T>, SceneError> {
         let shape = data.shape().to_vec();
         let data = self.squeezed(data, 4);
         let order = match (self.axes(), data.shape()) {
@@ -138,8 +117,45 @@ impl Place<'_> {
             };
         };
         let data = data.permuted_axes(IxDyn(&order)).into_dimensionality::<Ix4>();
-        Ok(data.map_err(|_| self.wrong(&shape, "four axes"))?.as_standard_layout().into_owned())
+        data.map_err(|_| self.wrong(&shape, "four axes"))
     }
+
+    /// Gray frames `[T, H, W]`; pictures may be color if all channels are equal.
+    pub(super) fn frames(&self, array: &Array, white: f32) -> Result<Array3<f32>, SceneError> {
+        let shape = array.shape();
+        if !self.is_picture() || shape.len() != 4 {
+            return Ok(match array.samples() {
+                Samples::Bytes(v) => in_units_of(white, self.three(self.laid_out(shape, v))?),
+                Samples::Floats(v) => in_units_of(white, self.three(self.laid_out(shape, v))?),
+            });
+        }
+        let pictures = self.channels(array, white)?;
+        let first = pictures.index_axis(Axis(1), 0);
+        if pictures.axis_iter(Axis(1)).any(|channel| channel != first) {
+            return Err(SceneError::Color { file: self.file.into(), key: self.key.into() });
+        }
+        Ok(first.to_owned())
+    }
+
+    /// A video `[T, C, H, W]`, C = 1 or 3.
+    pub(super) fn channels(&self, array: &Array, white: f32) -> Result<Array4<f32>, SceneError> {
+        let shape = array.shape();
+        Ok(match array.samples() {
+            Samples::Bytes(v) => in_units_of(white, self.four(self.laid_out(shape, v))?),
+            Samples::Floats(v) => in_units_of(white, self.four(self.laid_out(shape, v))?),
+        })
+    }
+}
+
+/// Samples divided by white, written once, in the order that they stand in.
+fn in_units_of<T, D>(white: f32, samples: ArrayView<'_, T, D>) -> ndarray::Array<f32, D>
+where
+    T: Copy + Into<f32> + Sync,
+    D: Dimension,
+{
+    let mut values = ndarray::Array::zeros(samples.raw_dim());
+    Zip::from(&mut values).and(samples).par_for_each(|to, &v| *to = v.into() / white);
+    values
 }
 
 #[cfg(test)]

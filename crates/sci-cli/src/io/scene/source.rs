@@ -1,6 +1,7 @@
 //! Owns what lies behind a path: named arrays, or one array without a name.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use super::{Keys, SceneError};
@@ -21,7 +22,9 @@ enum Content {
     Arrays(Vec<String>),
     /// Frames as pictures.
     Pictures,
-    /// A file of a known format.
+    /// An archive of NumPy arrays, read as they are needed.
+    Archive,
+    /// A file of another known format.
     File(Vec<u8>, Format),
     /// A file of which is said what it holds.
     Raw(Vec<u8>, Raw),
@@ -35,6 +38,8 @@ impl Source {
         let content = if path.is_dir() {
             let arrays = arrays_of(path)?;
             if arrays.is_empty() { Content::Pictures } else { Content::Arrays(arrays) }
+        } else if raw.is_none() && is_archive(path)? {
+            Content::Archive
         } else {
             let bytes = read_file(path)?;
             match (raw, Format::of(&bytes)) {
@@ -61,6 +66,7 @@ impl Source {
         match &self.content {
             Content::Arrays(_) => Format::Npy,
             Content::Pictures => Format::Png,
+            Content::Archive => Format::Npz,
             Content::File(_, format) | Content::Memory(format) => *format,
             Content::Raw(..) => Format::Raw,
         }
@@ -70,7 +76,7 @@ impl Source {
     pub(super) fn is_named(&self) -> bool {
         matches!(
             self.content,
-            Content::Arrays(_) | Content::Memory(_) | Content::File(_, Format::Mat | Format::Hdf5 | Format::Npz)
+            Content::Arrays(_) | Content::Archive | Content::Memory(_) | Content::File(_, Format::Mat | Format::Hdf5)
         )
     }
 
@@ -98,7 +104,10 @@ impl Source {
         let error = |e| FileError::new(&self.path, e);
         match &self.content {
             Content::File(bytes, Format::Mat | Format::Hdf5) => Ok(mat::read(bytes, wanted).map_err(error)?),
-            Content::File(bytes, Format::Npz) => Ok(npy::read_npz(bytes, wanted).map_err(error)?),
+            Content::Archive => {
+                let file = File::open(&self.path).map_err(|e| error(ReadError::Io(e)))?;
+                Ok(npy::read_npz(BufReader::new(file), wanted).map_err(error)?)
+            }
             Content::Arrays(names) => {
                 let mut found = NamedArrays { names: names.clone(), ..NamedArrays::default() };
                 for name in names.iter().filter(|n| wanted.contains(&n.as_str())) {
@@ -118,7 +127,9 @@ impl Source {
             Content::Pictures => Ok(frames::read(&self.path)?),
             Content::File(bytes, _) => Ok(read_single(bytes).map_err(|e| FileError::new(&self.path, e))?),
             Content::Raw(bytes, raw) => Ok(raw::read(bytes, *raw).map_err(|e| FileError::new(&self.path, e))?),
-            Content::Arrays(_) | Content::Memory(_) => Err(FileError::new(&self.path, ReadError::NoFrames).into()),
+            Content::Arrays(_) | Content::Archive | Content::Memory(_) => {
+                Err(FileError::new(&self.path, ReadError::NoFrames).into())
+            }
         }
     }
 
@@ -153,6 +164,14 @@ impl Source {
         let near = super::names::suggestion(key, &present, &Keys::default());
         SceneError::MissingKey { file: self.file.clone(), key: key.into(), part, near, present }
     }
+}
+
+/// Whether a file begins as an archive of NumPy arrays does.
+fn is_archive(path: &Path) -> Result<bool, FileError> {
+    let mut beginning = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(4).read_to_end(&mut beginning));
+    read.map_err(|e| FileError::new(path, ReadError::Io(e)))?;
+    Ok(npy::is_npz(&beginning))
 }
 
 /// The names of the arrays in a folder.
