@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use e2e::{Bench, workspace};
+use e2e::{Bench, on_the_demo};
 
 /// A browser on the `PATH`, or in `SCI_BROWSER`.
 fn browser() -> Option<PathBuf> {
@@ -67,8 +67,8 @@ fn dump(browser: &Path, bench: &Bench, page: &Path) -> String {
 fn the_slider_changes_the_frame() {
     let Some(browser) = browser() else { return };
     let bench = Bench::new();
-    let config = workspace().join("configs/demo.toml").display().to_string();
-    let run = bench.sci(&["run", &config, "--out", "run", "--set", "stage.0.iterations=3"]);
+    bench.write("scene.toml", on_the_demo("gray/gap-tv.toml", "kind = \"random\""));
+    let run = bench.sci(&["run", "scene.toml", "--out", "run", "--set", "stage.0.iterations=3"]);
     assert_eq!(run.code, 0, "{}", run.stderr);
     let page = std::fs::read_to_string(bench.path("run/report.html")).expect("a run writes its report");
     assert!(page.len() < 4_000_000, "{} bytes", page.len());

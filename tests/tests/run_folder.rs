@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use e2e::{Bench, Finished, assert_same, contents, page_data, sci, wait_for, workspace};
+use e2e::{Bench, Finished, assert_same, contents, on_the_demo, page_data, sci, wait_for};
 use ndarray::Array3;
 use serde_json::Value;
 
@@ -472,10 +472,10 @@ fn the_page_of_a_run_is_made_again_from_its_folder() {
 #[test]
 fn a_report_keeps_its_size() {
     let bench = Bench::new();
-    let config = workspace().join("configs/demo.toml").display().to_string();
+    bench.write("scene.toml", on_the_demo("gray/gap-tv.toml", "kind = \"random\""));
     let run = bench.sci(&[
         "run",
-        &config,
+        "scene.toml",
         "--out",
         "run",
         "--set",

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use e2e::{Bench, on_the_demo, workspace};
+use e2e::{Bench, on_the_demo};
 
 /// The mask of all runs.
 const RANDOM: &str = "kind = \"random\"";
@@ -21,9 +21,10 @@ fn run(bench: &Bench, config: &Path, out: &str, set: &[&str]) -> Vec<u8> {
 #[test]
 fn switched_off_it_changes_no_bit() {
     let bench = Bench::new();
-    let demo = workspace().join("configs/demo.toml");
-    let without = run(&bench, &demo, "without", &[]);
-    let off = run(&bench, &demo, "off", &["skip.enabled=false", "skip.overshoot=1"]);
+    std::fs::write(bench.path("scene.toml"), on_the_demo("gray/gap-tv.toml", RANDOM)).unwrap();
+    let scene = bench.path("scene.toml");
+    let without = run(&bench, &scene, "without", &[]);
+    let off = run(&bench, &scene, "off", &["skip.enabled=false", "skip.overshoot=1"]);
     assert!(without == off);
     let record = bench.record("off");
     let m = &record["measurements"][0];

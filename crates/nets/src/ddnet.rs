@@ -12,7 +12,7 @@
 
 use crate::fastdvdnet::{check_widths, recognise_blocks};
 use crate::layers::{Conv, Source};
-use crate::network::{Layers, Network, Padding, Window, check_clips, copy_to, reflect, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, reflect};
 use crate::video::{BlockSpec, Ends, Residual, VideoNet};
 use crate::weights::WeightFile;
 use crate::{Architecture, Error, Result};
@@ -99,16 +99,6 @@ impl Ddnet {
     pub fn spec(&self) -> DdnetSpec {
         self.spec
     }
-
-    /// The RGB video of sparse RGGB frames, both `[T, 3, H, W]`.
-    fn fill_in(&mut self, sparse: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<()> {
-        let device = self.device();
-        if device.is_cpu() {
-            return self.net.infer(sparse, 0.0, out);
-        }
-        let rgb = self.forward(&to_tensor(sparse, &device)?, &[0.0])?;
-        Ok(copy_to(&rgb, out)?)
-    }
 }
 
 /// The RGGB mosaic `[T, H, W]` as sparse RGB `[T, 3, H, W]`.
@@ -180,7 +170,7 @@ impl Network for Ddnet {
 
     /// Frames of a mosaic; no σ is looked at.
     fn infer(&mut self, _: &Call<'_>, clip: ArrayView4<'_, f32>, out: ArrayViewMut4<'_, f32>) -> Result<(), BoxError> {
-        Ok(self.fill_in(clip, out)?)
+        Ok(self.net.infer(clip, 0.0, out)?)
     }
 
     fn sees_mosaics(&self) -> bool {
@@ -213,10 +203,10 @@ impl Demosaicer for Ddnet {
         }
         let sparse = sparse_rgb(cfa, mosaic);
         if sparse.dim() == rgb.dim() {
-            return Ok(self.fill_in(sparse.view(), rgb)?);
+            return Ok(self.net.infer(sparse.view(), 0.0, rgb)?);
         }
         let mut whole = Array4::zeros(sparse.dim());
-        self.fill_in(sparse.view(), whole.view_mut())?;
+        self.net.infer(sparse.view(), 0.0, whole.view_mut())?;
         let (top, left) = shift(cfa);
         rgb.assign(&whole.slice(s![.., .., top.., left..]));
         Ok(())

@@ -15,13 +15,13 @@
 use crate::infer::{Cache, join_phases, set_channel, set_phases};
 use crate::kernels::Conv3x3;
 use crate::layers::{Conv, Shift, Source, chain};
-use crate::network::{Layers, Network, Padding, Window, check_clips, check_video, copy_to, crop, noise_map, to_tensor};
+use crate::network::{Layers, Network, Padding, Window, check_clips, crop, denoise_clip, noise_map};
 use crate::weights::WeightFile;
 use crate::{Architecture, Error, Result};
 use admm::{BoxError, Call, Denoiser};
 use candle_core::Tensor;
 use candle_nn::ops::{pixel_shuffle, pixel_unshuffle};
-use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4, Axis};
+use ndarray::{ArrayView3, ArrayView4, ArrayViewMut3, ArrayViewMut4};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
@@ -281,22 +281,11 @@ impl Denoiser for Ffdnet {
         &mut self,
         call: &Call<'_>,
         noisy: ArrayView4<'_, f32>,
-        mut out: ArrayViewMut4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
     ) -> std::result::Result<(), BoxError> {
-        let sigma = call.required_sigma()?;
-        check_video(self, sigma, noisy, &out)?;
-        if noisy.is_empty() {
-            return Ok(());
-        }
-        let device = self.device();
-        for (frame, out) in noisy.outer_iter().zip(out.outer_iter_mut()) {
-            if device.is_cpu() {
-                self.infer_frame(frame, sigma, out)?;
-            } else {
-                let clean = self.forward(&to_tensor(frame.insert_axis(Axis(0)), &device)?, &[sigma])?;
-                copy_to(&clean, out.insert_axis(Axis(0))).map_err(Error::from)?;
-            }
-        }
-        Ok(())
+        denoise_clip(self, call, noisy, out, |net, noisy, sigma, mut out| {
+            let mut frames = noisy.outer_iter().zip(out.outer_iter_mut());
+            frames.try_for_each(|(frame, out)| net.infer_frame(frame, sigma, out))
+        })
     }
 }

@@ -128,10 +128,6 @@ impl Conv {
         self.weight.elem_count() as f64
     }
 
-    pub(crate) fn device(&self) -> &Device {
-        self.weight.device()
-    }
-
     /// Whether a tensor is a variable ([`Conv::make_trainable`]), which changes behind the network's back.
     pub(crate) fn is_variable(&self) -> bool {
         let norm = self.norm.iter().flat_map(|norm| [&norm.gamma, &norm.beta]);

@@ -4,7 +4,7 @@ use crate::kernels::Precision;
 use crate::layers::{Conv, Parameters};
 use crate::{Error, KeyReport};
 use admm::{BoxError, Call};
-use candle_core::{Device, Tensor, Var};
+use candle_core::{Tensor, Var};
 use ndarray::{ArrayView4, ArrayViewMut4, Axis};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -36,7 +36,7 @@ pub trait Layers: Send + Sync {
     #[doc(hidden)]
     fn convs_mut(&mut self) -> Vec<&mut Conv>;
 
-    /// What inference, as a denoiser on the CPU, multiplies: f32 unless this asks for [`Precision::Bf16`].
+    /// What inference, as a denoiser, multiplies: f32 unless this asks for [`Precision::Bf16`].
     fn set_inference_precision(&mut self, precision: Precision) {
         // What inference has packed stays unless something changes.
         if self.convs().iter().any(|conv| conv.inference().precision != precision) {
@@ -134,24 +134,6 @@ pub trait Layers: Send + Sync {
             conv.fold()?;
         }
         Ok(())
-    }
-
-    /// Moves the tensors to another device; trainable tensors become constants.
-    ///
-    /// # Errors
-    /// When the device refuses.
-    fn to_device(&mut self, device: &Device) -> Result<(), Error> {
-        for conv in self.convs_mut() {
-            for (_, tensor, _) in conv.tensors_mut() {
-                *tensor = tensor.detach().to_device(device)?;
-            }
-        }
-        Ok(())
-    }
-
-    /// The device of the tensors.
-    fn device(&self) -> Device {
-        self.convs().first().map_or(Device::Cpu, |conv| conv.device().clone())
     }
 
     /// Number of trainable values.
@@ -271,40 +253,20 @@ pub(crate) fn check_video(
     Ok(())
 }
 
-/// [`admm::Denoiser::denoise`] of a network that takes whole clips: `on_cpu` where its tensors are there, else its graph.
+/// [`admm::Denoiser::denoise`] of a network, by `infer`.
 pub(crate) fn denoise_clip<N: Network>(
     net: &mut N,
     call: &Call<'_>,
     noisy: ArrayView4<'_, f32>,
     out: ArrayViewMut4<'_, f32>,
-    on_cpu: impl FnOnce(&mut N, ArrayView4<'_, f32>, f32, ArrayViewMut4<'_, f32>) -> Result<(), Error>,
+    infer: impl FnOnce(&mut N, ArrayView4<'_, f32>, f32, ArrayViewMut4<'_, f32>) -> Result<(), Error>,
 ) -> Result<(), BoxError> {
     let sigma = call.required_sigma()?;
     check_video(net, sigma, noisy, &out)?;
     if noisy.is_empty() {
         return Ok(());
     }
-    let device = net.device();
-    if device.is_cpu() {
-        on_cpu(net, noisy, sigma, out)?;
-    } else {
-        let clean = net.forward(&to_tensor(noisy, &device).map_err(Error::from)?, &[sigma])?;
-        copy_to(&clean, out).map_err(Error::from)?;
-    }
-    Ok(())
-}
-
-/// Frames as a tensor on `device`.
-pub(crate) fn to_tensor(frames: ArrayView4<'_, f32>, device: &Device) -> candle_core::Result<Tensor> {
-    let shape = frames.dim();
-    Tensor::from_vec(frames.iter().copied().collect::<Vec<f32>>(), shape, device)
-}
-
-/// The values of a tensor of the shape of `out`.
-pub(crate) fn copy_to(tensor: &Tensor, mut out: ArrayViewMut4<'_, f32>) -> candle_core::Result<()> {
-    let values = tensor.flatten_all()?.to_vec1::<f32>()?;
-    out.iter_mut().zip(values).for_each(|(o, v)| *o = v);
-    Ok(())
+    Ok(infer(net, noisy, sigma, out)?)
 }
 
 /// The σ of each frame as a map `[N, 1, H, W]` of the size and kind of `beside`.

@@ -10,7 +10,7 @@
 //! five frames, besides one video for each stage. Frames of FFDNet, which reaches few rows, are taken a strip at a time.
 
 use crate::Result;
-use candle_core::{DType, Tensor, Var};
+use candle_core::{DType, Device, Tensor, Var};
 use ndarray::{Array2, ArrayView2, ArrayView4, Axis, Zip};
 use nets::{Network, Window};
 use rand::{RngExt, SeedableRng};
@@ -123,9 +123,8 @@ pub fn accumulate_gradient(
 ) -> Result<()> {
     assert_eq!(input.dim(), upstream.dim(), "the gradient belongs to a video of the input's shape");
     assert_eq!(vars.len(), sums.len(), "a sum for each variable");
-    let device = network.device();
     let tensor = |video: ArrayView4<'_, f32>| {
-        Tensor::from_vec(video.iter().copied().collect::<Vec<f32>>(), video.dim(), &device)
+        Tensor::from_vec(video.iter().copied().collect::<Vec<f32>>(), video.dim(), &Device::Cpu)
     };
     let stages = network.stages(input.len_of(Axis(0)));
     let mut read = vec![network.padded(&tensor(input)?)?];

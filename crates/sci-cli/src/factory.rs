@@ -13,7 +13,7 @@ use sci_forward::{CfaPattern, Measurement};
 use crate::config::{Experiment, Stage};
 use crate::io::scene::Scene;
 use crate::parts::{Built, Learning, MultiplyAdds, Saving, Sensor, Site, Work};
-use crate::record::Adaptation;
+use crate::record::{Adaptation, host};
 use crate::solvers::{self, Priors};
 
 /// Builds the solvers of one experiment.
@@ -294,9 +294,7 @@ impl<'e> Factory<'e> {
         if self.has_network() {
             return Ok(Isa::detect()?.name());
         }
-        // Solvers choose by themselves, and the matrix unit is not for them.
-        let own = Isa::ALL.into_iter().filter(|isa| *isa != Isa::Amx).find(|isa| isa.available());
-        Ok(own.unwrap_or(Isa::Portable).name())
+        Ok(host::solver_kernel().name())
     }
 
     /// What networks multiply: bf16 is for the matrix unit only; `halved` is the share that `[skip]` chose it for.

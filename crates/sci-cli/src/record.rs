@@ -344,6 +344,9 @@ impl Record {
 pub mod host {
     use std::fs;
 
+    use nets::kernels::Isa;
+    use sysinfo::{CpuRefreshKind, System};
+
     /// Version of `sci`.
     pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -352,10 +355,16 @@ pub mod host {
 
     /// The processor's name, or its architecture where the system does not tell.
     pub fn cpu() -> String {
-        fs::read_to_string("/proc/cpuinfo")
-            .ok()
-            .and_then(|info| field(&info, "model name").map(str::to_owned))
-            .unwrap_or_else(|| std::env::consts::ARCH.to_owned())
+        let mut system = System::new();
+        system.refresh_cpu_list(CpuRefreshKind::nothing());
+        let name = system.cpus().first().map(|cpu| cpu.brand().trim().to_owned());
+        name.filter(|name| !name.is_empty()).unwrap_or_else(|| std::env::consts::ARCH.to_owned())
+    }
+
+    /// The instruction set of the solvers, which choose by themselves; the matrix unit is not for them.
+    pub fn solver_kernel() -> Isa {
+        let own = Isa::ALL.into_iter().filter(|isa| *isa != Isa::Amx).find(|isa| isa.available());
+        own.unwrap_or(Isa::Portable)
     }
 
     /// The largest resident memory of this process so far in bytes; 0 where the system does not tell.

@@ -60,7 +60,7 @@ impl Link {
 /// `y[n,o] = f(b[o] + Σ_i w[o,i] ⋆ x[n,i])`, differentiable in all three arguments; `f` is the identity or `max(·, 0)`.
 ///
 /// Shapes: `x [N,Cin,H,W]`, `w [Cout,Cin/groups,3,3]`, `bias [Cout]`, result `[N,Cout,⌈H/stride⌉,⌈W/stride⌉]`.
-/// f32 on the CPU runs on the kernels of this module, anything else on candle's own operations.
+/// f32 runs on the kernels of this module, other types on candle's own operations.
 ///
 /// ```
 /// use candle_core::{Device, Tensor};
@@ -79,10 +79,10 @@ pub fn conv3x3(x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> 
     conv_chain(x, &[Link::new(w.clone(), bias.cloned(), opts)])
 }
 
-/// As [`conv3x3`], for f32 on the CPU and a given instruction set.
+/// As [`conv3x3`], for f32 and a given instruction set.
 ///
 /// # Errors
-/// As [`conv3x3`], when a tensor is not f32 on the CPU, and when this machine lacks the instruction set.
+/// As [`conv3x3`], when a tensor is not f32, and when this machine lacks the instruction set.
 pub fn conv3x3_on(isa: Isa, x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts: Conv3x3) -> Result<Tensor> {
     Chain::run(isa, x, &[Link::new(w.clone(), bias.cloned(), opts)])
 }
@@ -103,7 +103,7 @@ pub fn conv3x3_on(isa: Isa, x: &Tensor, w: &Tensor, bias: Option<&Tensor>, opts:
 /// # Errors
 /// As [`conv3x3`].
 pub fn conv_chain(x: &Tensor, links: &[Link]) -> Result<Tensor> {
-    let ours = |t: &Tensor| t.device().is_cpu() && t.dtype() == DType::F32;
+    let ours = |t: &Tensor| t.dtype() == DType::F32;
     if !links.is_empty() && ours(x) && links.iter().flat_map(Link::tensors).all(ours) {
         let bf16 = links.iter().all(|link| link.opts.precision == Precision::Bf16);
         let isa = if bf16 { Isa::detect() } else { Isa::detect_for_gradients() };
@@ -464,13 +464,13 @@ fn numbers<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     }
 }
 
-/// The numbers of an f32 tensor on the CPU, in order.
+/// The numbers of an f32 tensor, in order.
 pub(crate) fn with_numbers<R>(t: &Tensor, f: impl FnOnce(&[f32]) -> Result<R>) -> Result<R> {
     let t = t.contiguous()?;
     let (storage, layout) = t.storage_and_layout();
     match &*storage {
         Storage::Cpu(s) => f(numbers(s, layout)?),
-        _ => candle_core::bail!("conv3x3: the tensor left the CPU"),
+        _ => candle_core::bail!("conv3x3: the tensor is not on the CPU"),
     }
 }
 

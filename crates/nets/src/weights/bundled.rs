@@ -24,6 +24,11 @@ pub fn bundled_names() -> Vec<&'static str> {
     BUNDLED.iter().map(|(name, _)| *name).collect()
 }
 
+/// The same with the bytes that each takes in the program.
+pub fn bundled_sizes() -> Vec<(&'static str, usize)> {
+    BUNDLED.iter().map(|(name, bytes)| (*name, bytes.len())).collect()
+}
+
 /// Whether a path is that of bundled weights for the iterates of a solver, whose names end in `_sci`. They are no denoisers of
 /// white noise, and know the σ of their schedule only.
 pub fn bundled_for_iterates(path: &str) -> bool {

@@ -12,7 +12,7 @@ use candle_core::{DType, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-pub use bundled::{bundled_for_iterates, bundled_names};
+pub use bundled::{bundled_for_iterates, bundled_names, bundled_sizes};
 use stored::Named;
 pub(crate) use stored::read_safetensors;
 

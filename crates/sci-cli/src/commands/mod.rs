@@ -12,6 +12,7 @@ macro_rules! outln {
 
 mod calibrate;
 mod completions;
+mod doctor;
 mod gather;
 mod man;
 mod mask;
@@ -73,6 +74,11 @@ enum Command {
     Weights(weights::Command),
     /// Compare finished runs
     Report(report::Args),
+    /// Look at this machine, and whether sci works here
+    ///
+    /// Says what is used of the processor, where data are looked for and which programs are missing, and solves a small scene. Ends
+    /// with 1 if something is broken. Its output is what to add to a report of a problem.
+    Doctor(doctor::Args),
     /// Print what makes a shell complete the commands
     ///
     /// For bash, for example: sci completions bash > ~/.local/share/bash-completion/completions/sci
@@ -135,6 +141,7 @@ impl Command {
             Command::Train(args) => args.run(),
             Command::Weights(command) => command.run(),
             Command::Report(args) => args.run(),
+            Command::Doctor(args) => args.run(),
             Command::Completions(args) => args.run(),
             Command::Man(args) => args.run(),
         }

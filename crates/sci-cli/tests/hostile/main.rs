@@ -230,13 +230,13 @@ fn damaged_files_are_harmless() {
         .unwrap();
     check(".jpg", &jpeg, |b| frames::decode(b).is_ok());
 
-    let demo = include_str!("../../../../configs/demo.toml");
+    let gray = include_str!("../../../../configs/gray/gap-tv.toml");
     let experiment = |b: &[u8]| {
         let text = String::from_utf8_lossy(b);
-        let source = Source::new("a.toml".as_ref(), &text, &[], &|_| Ok(demo.to_owned()));
+        let source = Source::new("a.toml".as_ref(), &text, &[], &|_| Ok(gray.to_owned()));
         source.and_then(|source| config::check(&source)).is_ok()
     };
-    check("experiment, gray", demo.as_bytes(), experiment);
+    check("experiment, gray", gray.as_bytes(), experiment);
     check("experiment, color", include_bytes!("../../../../configs/color/default.toml"), experiment);
     check("experiment that extends another", b"extends = 'b.toml'\n[denoiser]\nweight = 0.2\n", experiment);
     check("training file", include_bytes!("../../../../configs/train/fastdvdnet_gray.toml"), is_training);
