@@ -42,13 +42,14 @@ impl Body {
         file.shape(&format!("{prefix}{PREFIX}input.weight")).is_some()
     }
 
-    /// Channels shown and found, widths and blocks by the tensors of a file.
-    pub(crate) fn recognise(file: &WeightFile) -> Option<((usize, usize), [usize; LEVELS], [usize; LEVELS])> {
+    /// By the tensors of a file.
+    pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
         let outputs = |name: &str| file.shape(&format!("{PREFIX}{name}.weight"))?.first().copied();
         let widths = [outputs("input")?, outputs("down0")?, outputs("down1")?];
         let blocks = |place: &str| (0..).take_while(|k| outputs(&format!("{place}.{k}.0")).is_some()).count();
         let shown = *file.shape(&format!("{PREFIX}input.weight"))?.get(1)?;
-        Some(((shown, outputs("output")?), widths, ["enter0", "enter1", "deepest"].map(blocks)))
+        let blocks = ["enter0", "enter1", "deepest"].map(blocks);
+        Some(Self { ends: (shown, outputs("output")?), widths, blocks })
     }
 
     pub(crate) fn validate(self) -> Result<()> {

@@ -107,7 +107,7 @@ impl Experts {
 
 impl ShiftnetSpec {
     pub(crate) fn recognise(file: &WeightFile) -> Option<Self> {
-        let ((shown, found), widths, blocks) = Body::recognise(file)?;
+        let Body { ends: (shown, found), widths, blocks } = Body::recognise(file)?;
         let window = (shown - 1) / found.max(1);
         let below: Vec<u8> = (1..=u8::MAX).rev().filter(|sigma| Body::is_in(file, &format!("below{sigma}."))).collect();
         Some(Self { channels: found / PHASES, window, widths, blocks, experts: Experts::new(&below).ok()? })
