@@ -21,6 +21,12 @@ pub(crate) struct Options {
     /// The demo's first snapshot instead of the paper's scenes, with the program that tests use: half a minute, and no data are needed
     #[arg(long, conflicts_with = "save")]
     demo: bool,
+    /// Only the first measurement of each scene: less time, but figures that are not the published ones' means
+    #[arg(long, conflicts_with_all = ["check", "demo", "save"])]
+    first: bool,
+    /// Only rows whose names hold this
+    #[arg(long, value_name = "TEXT", default_value = "", conflicts_with = "save")]
+    row: String,
     /// Keep the table in xtask/results/CPU/
     #[arg(long)]
     save: bool,
@@ -101,7 +107,12 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let path = root().join("configs/expected.toml");
     let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     let expected: Expected = toml::from_str(&text).with_context(|| path.display().to_string())?;
-    let table = if options.table == Which::TableGray { &expected.gray } else { &expected.color };
+    let mut table = if options.table == Which::TableGray { expected.gray } else { expected.color };
+    table.row.retain(|row| row.name.contains(&options.row));
+    if options.first {
+        table.scenes.iter_mut().for_each(|scene| scene.measurements = Some(vec![0]));
+    }
+    let table = &table;
     let off = if options.demo {
         on_demo(table, &expected.tolerance)?
     } else {
