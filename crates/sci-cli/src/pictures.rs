@@ -167,7 +167,7 @@ impl Studio<'_> {
 
     /// Each frame as a PNG, which the report may use too.
     fn frames(&self, dir: &Path, index: usize, result: ArrayView4<'_, f32>) -> Result<Vec<Vec<u8>>, WriteError> {
-        let pngs = frames::pngs(result).map_err(|e| WriteError::new(dir, e))?;
+        let pngs = frames::pngs(result, usize::MAX).map_err(|e| WriteError::new(dir, e))?;
         for (t, png) in pngs.iter().enumerate() {
             let path = dir.join(frame_name(index, t));
             fs::write(&path, png).map_err(|e| WriteError::new(&path, e))?;

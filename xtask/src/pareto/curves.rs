@@ -56,6 +56,7 @@ const GRAY: &[Curve] = &[
     curve("ADMM-FFDNet", "gray/gap-ffdnet-fast.toml", NET).with(&[WEIGHTS, "solver={kind='admm'}"]),
     curve("GAP-FFDNet, [skip]", "gray/gap-ffdnet-fast.toml", Budget::Stages(&[5, 10]))
         .with(&[WEIGHTS, "skip.enabled=true"]),
+    curve("GAP-ShiftNet for iterates", "gray/fast.toml", Budget::Sigmas(&[3, 5, 7])),
     curve("GAP-FastDVDnet for iterates", "gray/default.toml", Budget::Sigmas(&[4, 8, 12])),
     curve("GAP-FastDVDnet for iterates, then WNNM", "gray/refined.toml", Budget::Last(&[1, 2, 4, 6])),
 ];
@@ -67,6 +68,7 @@ const COLOR: &[Curve] = &[
     curve("two-stage FFDNet, scaled", "color/two-stage-ffdnet-fast.toml", COLOR_NET),
     curve("two-stage FFDNet, scaled, [skip]", "color/two-stage-ffdnet-fast.toml", Budget::Stages(&[4]))
         .with(&["skip.enabled=true"]),
+    curve("GAP-ShiftNet for iterates", "color/fast.toml", Budget::Sigmas(&[3, 5, 7])),
     curve("GAP-FastDVDnet for iterates", "color/default.toml", Budget::Sigmas(&[4, 6, 8])),
     curve("GAP-FastDVDnet for iterates, then WNNM", "color/refined.toml", Budget::Last(&[1, 2, 4, 6])),
 ];

@@ -94,11 +94,12 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let suite = options.suite;
     let kept = results_dir()?.join(format!("pareto-{}.json", suite.name()));
     let mut results = if options.save && kept.is_file() { Results::read(&kept)? } else { Results::default() };
+    let mut faults = Vec::new();
     if options.runs > 0 {
         let sci = Sci::build(options.shared.as_deref())?;
-        (0..options.runs).try_for_each(|_| round(options, &sci, &mut results))?;
+        (0..options.runs).try_for_each(|_| round(options, &sci, &mut results, &mut faults))?;
     }
-    ensure!(!results.points.is_empty(), "nothing was measured");
+    ensure!(!results.points.is_empty(), "nothing was measured\n{}", faults.join("\n"));
     (results.suite, results.cpu, results.revision) = (suite.name().into(), cpu(), revision()?);
     print!("{}", draw::table(&results));
     if options.save {
@@ -106,11 +107,12 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
         draw::draw(suite, &results, &results_dir()?)?;
         println!("wrote {}", kept.display());
     }
+    ensure!(faults.is_empty(), "{}", faults.join("\n"));
     Ok(())
 }
 
-/// Every curve at every budget on every scene once, the peers too.
-fn round(options: &Options, sci: &Sci, results: &mut Results) -> anyhow::Result<()> {
+/// Every curve at every budget on every scene once, the peers too; what did not run to its end is among the `faults`.
+fn round(options: &Options, sci: &Sci, results: &mut Results, faults: &mut Vec<String>) -> anyhow::Result<()> {
     let shared = shared(options.shared.as_deref())?;
     let wanted = |name: &str, filter: &Option<String>| filter.as_ref().is_none_or(|f| name.contains(f.as_str()));
     for scene in options.suite.scenes().iter().filter(|s| wanted(s.file, &options.scene)) {
@@ -124,7 +126,7 @@ fn round(options: &Options, sci: &Sci, results: &mut Results) -> anyhow::Result<
                 for variant in [None, options.variant.as_deref()].into_iter().take(1 + options.variant.iter().len()) {
                     match measure(sci, curve, number, variant, &data) {
                         Ok(point) => results.push(point),
-                        Err(e) => println!("{} × {number} on {}: {e:#}", curve.name, scene.file),
+                        Err(e) => faults.push(format!("{} × {number} on {}: {e:#}", curve.name, scene.file)),
                     }
                 }
             }

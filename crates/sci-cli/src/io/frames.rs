@@ -223,13 +223,17 @@ pub fn png(frame: ArrayView3<'_, f32>) -> ImageResult<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Each frame of `[T, C, H, W]` as a PNG.
+/// Each frame of `[T, C, H, W]` as a PNG, halved until no side is longer than `side`.
 ///
 /// # Errors
 /// The encoder's.
-pub fn pngs(video: ArrayView4<'_, f32>) -> ImageResult<Vec<Vec<u8>>> {
-    let frames: Vec<ArrayView3<'_, f32>> = video.outer_iter().collect();
-    frames.par_iter().map(|frame| png(*frame)).collect()
+pub fn pngs(video: ArrayView4<'_, f32>, side: usize) -> ImageResult<Vec<Vec<u8>>> {
+    let encoded = |frame: ArrayView4<'_, f32>| {
+        let small = (longer_side(frame) > side).then(|| halved_to(frame, side));
+        png(small.as_ref().map_or(frame, |small| small.view()).index_axis(Axis(0), 0))
+    };
+    let frames: Vec<_> = video.axis_chunks_iter(Axis(0), 1).collect();
+    frames.into_par_iter().map(encoded).collect()
 }
 
 /// Half the height and width of a video `[T, C, H, W]`, each pixel the mean of four; an odd last row or column is left out.
@@ -254,12 +258,20 @@ fn halve(half: ArrayViewMut1<'_, f32>, top: ArrayView1<'_, f32>, bottom: ArrayVi
     half.into_iter().zip(fours).for_each(|(half, ([a, b], [c, d]))| *half = 0.25 * (a + b + c + d));
 }
 
-/// A video of half the height and width, once or as often as it takes until no side is longer than `side`.
+/// A video of half the height and width, once or as often as it takes until no side is longer than `side`. No more than a frame for each
+/// thread is in memory in a size between.
 pub fn halved_to(video: ArrayView4<'_, f32>, side: usize) -> Array4<f32> {
-    let mut small = halved(video);
-    while longer_side(small.view()) > side {
-        small = halved(small.view());
+    let (frames, channels, mut height, mut width) = video.dim();
+    let mut times = 0;
+    while times == 0 || height.max(width) > side {
+        (height, width, times) = ((height / 2).max(1), (width / 2).max(1), times + 1);
     }
+    let mut small = Array4::zeros((frames, channels, height, width));
+    let pairs = small.axis_chunks_iter_mut(Axis(0), 1).into_par_iter().zip(video.axis_chunks_iter(Axis(0), 1));
+    pairs.for_each(|(mut small, frame)| {
+        let first = halved(frame);
+        small.assign(&(1..times).fold(first, |frame, _| halved(frame.view())));
+    });
     small
 }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use sci_forward::CfaPattern;
 use serde::Serialize;
 
-use crate::io::frames::{self, halved_to, longer_side, pngs};
+use crate::io::frames::{self, longer_side, pngs};
 use crate::solve::psnr_rgb;
 
 /// Frames are not made smaller than this, in pixels of the longer side, but left out.
@@ -55,10 +55,7 @@ impl Pictures {
     /// If a truth has another size than its result.
     pub fn of(images: &MeasurementImages<'_>, full: Option<Vec<Vec<u8>>>, limit: usize) -> Result<Self, ImageError> {
         let shrink = shrink(images, full.as_deref(), limit)?;
-        let encode = |video: ArrayView4<'_, f32>| match shrink {
-            1 => pngs(video),
-            _ => pngs(halved_to(video, longer_side(video) / shrink).view()),
-        };
+        let encode = |video: ArrayView4<'_, f32>| pngs(video, longer_side(video) / shrink);
         let recon = match full {
             Some(full) if shrink == 1 => full,
             _ => encode(images.recon)?,

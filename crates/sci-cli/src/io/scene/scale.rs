@@ -5,7 +5,7 @@
 //! said.
 
 use crate::io::Format;
-use crate::io::samples::{Array, SampleType};
+use crate::io::samples::{Array, SampleType, Samples};
 
 use ndarray::{Array3, ArrayView3, Axis};
 
@@ -54,12 +54,17 @@ pub(super) struct Content {
 impl Content {
     pub(super) fn of(array: &Array, format: Format) -> Self {
         let (mut max, mut whole, mut ones) = (0f32, true, 0u32);
-        for i in 0..array.samples().len() {
-            let v = array.samples().at(i);
-            if v.is_finite() {
-                max = max.max(v.abs());
-                whole &= v.fract() == 0.0;
-                ones |= v.abs() as u32;
+        match array.samples() {
+            Samples::Bytes(bytes) => {
+                max = f32::from(bytes.iter().copied().max().unwrap_or(0));
+                ones = u32::from(bytes.iter().fold(0, |ones, &b| ones | b));
+            }
+            Samples::Floats(values) => {
+                for v in values.iter().copied().filter(|v| v.is_finite()) {
+                    max = max.max(v.abs());
+                    whole &= v.fract() == 0.0;
+                    ones |= v.abs() as u32;
+                }
             }
         }
         let usual = usual(format, array.stored());
@@ -219,7 +224,6 @@ fn told_by_truth(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::io::samples::Samples;
     use ndarray::Array3;
 
     fn content(values: &[f32], stored: SampleType, format: Format) -> Content {
