@@ -1,6 +1,8 @@
 //! What the ways of convolving have in common: how it is done, its filters, and the pieces that an image is cut into.
 
-use super::blocked::{Pixel, View, ViewMut, ZERO, check_len};
+#[cfg(target_arch = "x86_64")]
+use super::blocked::{Pixel, ZERO};
+use super::blocked::{View, ViewMut, check_len};
 use super::error::KernelError;
 use super::simd::LANES;
 
@@ -118,7 +120,8 @@ impl<'a> Weights<'a> {
         self.index(o, c, tap).map_or(0.0, |i| self.data[i])
     }
 
-    /// The filters of a block of outputs for input `c`, one pixel of outputs for each tap; zeros where there are none.
+    /// The filters of a block of outputs for input `c`, one pixel of outputs for each tap; zeros where there are none. For the matrix unit.
+    #[cfg(target_arch = "x86_64")]
     pub(super) fn block(&self, block: usize, c: usize) -> [Pixel; 9] {
         let mut taps = [ZERO; 9];
         let outputs = block * LANES..self.outputs.min((block + 1) * LANES);

@@ -111,7 +111,8 @@ impl Finished {
         for entry in fs::read_dir(&self.dir).map_err(fail(&self.dir))? {
             let path = entry.map_err(fail(&self.dir))?.path();
             if path.is_file() {
-                File::open(&path).and_then(|file| file.sync_all()).map_err(fail(&path))?;
+                // Windows writes out only what is open for writing.
+                File::options().write(true).open(&path).and_then(|file| file.sync_all()).map_err(fail(&path))?;
             }
         }
         Ok(())
