@@ -67,7 +67,7 @@ fn dump(browser: &Path, bench: &Bench, page: &Path) -> String {
 fn the_slider_changes_the_frame() {
     let Some(browser) = browser() else { return };
     let bench = Bench::new();
-    bench.write("scene.toml", on_the_demo("gray/gap-tv.toml", "kind = \"random\""));
+    bench.write("scene.toml", on_the_demo("gray/gap-tv-fast.toml", "kind = \"random\""));
     let run = bench.sci(&["run", "scene.toml", "--out", "run", "--set", "stage.0.iterations=3"]);
     assert_eq!(run.code, 0, "{}", run.stderr);
     let page = std::fs::read_to_string(bench.path("run/report.html")).expect("a run writes its report");

@@ -472,7 +472,7 @@ fn the_page_of_a_run_is_made_again_from_its_folder() {
 #[test]
 fn a_report_keeps_its_size() {
     let bench = Bench::new();
-    bench.write("scene.toml", on_the_demo("gray/gap-tv.toml", "kind = \"random\""));
+    bench.write("scene.toml", on_the_demo("gray/gap-tv-fast.toml", "kind = \"random\""));
     let run = bench.sci(&[
         "run",
         "scene.toml",
