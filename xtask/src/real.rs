@@ -105,7 +105,8 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
                 .map(|key| of(key).map_or_else(|| "–".to_owned(), |value| format!("{value:.2}")));
             let seconds = of("seconds").context("the record has no seconds")?;
             tell(format!("| {} | {config} | {psnr} | {predicted} | {seconds:.1} |", scene.name));
-            page.run(config, &format!("{psnr} dB, predicted {predicted} dB, {seconds:.1} s"), &folder, &record)?;
+            let figures = format!("PSNR {psnr} dB, predicted {predicted} dB, {seconds:.1} s");
+            page.run(config, &figures, &folder, &record)?;
         }
     }
     println!("wrote {}", page.write()?.display());
