@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::Context;
 
-use crate::workspace::{Sci, results_dir, root};
+use crate::workspace::{Sci, Told, root};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -31,13 +31,9 @@ pub(crate) struct Options {
 pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let sci = Sci::build(None)?;
     let folder = tempfile::tempdir().context("no temporary folder")?;
-    let mut kept = String::new();
-    let mut tell = |line: String| {
-        println!("{line}");
-        kept += &(line + "\n");
-    };
-    tell("| experiment | scene | bands | memory, MB | s of solving | s in all | s a megapixel and frame |".into());
-    tell("|---|---|---|---|---|---|---|".into());
+    let mut told = Told::default();
+    told.line("| experiment | scene | bands | memory, MB | s of solving | s in all | s a megapixel and frame |");
+    told.line("|---|---|---|---|---|---|---|");
     for &rows in &options.rows {
         let columns = (rows * 16 / 9).next_multiple_of(2);
         let scene = folder.path().join("scene");
@@ -50,7 +46,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
             let number = |value: &serde_json::Value| value.as_f64().context("the record lacks a number");
             let seconds = number(&record["measurements"][0]["seconds"])?;
             let megapixels = f64::from(options.frames) * (rows * columns) as f64 / 1e6;
-            tell(format!(
+            told.line(&format!(
                 "| {name} | {columns}×{rows}×{} | {} | {:.0} | {seconds:.1} | {:.1} | {:.3} |",
                 options.frames,
                 record["measurements"][0]["bands"].as_u64().unwrap_or(1),
@@ -61,9 +57,7 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
         }
     }
     if options.save {
-        let path = results_dir()?.join("large.md");
-        fs::write(&path, kept).with_context(|| path.display().to_string())?;
-        println!("wrote {}", path.display());
+        told.save("large.md")?;
     }
     Ok(())
 }

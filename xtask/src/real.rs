@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use serde_json::Value;
 
-use crate::workspace::{Sci, results_dir, root, shared};
+use crate::workspace::{Sci, Told, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -83,13 +83,9 @@ const COLOR: [(&str, &[&str]); 7] = [
 pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let shared = shared(options.shared.as_deref())?;
     let sci = Sci::build(Some(&shared))?;
-    let mut table = String::new();
-    let mut tell = |line: String| {
-        println!("{line}");
-        table += &(line + "\n");
-    };
-    tell("| scene | experiment | PSNR, dB | predicted PSNR, dB | seconds |".into());
-    tell("|---|---|---|---|---|".into());
+    let mut told = Told::default();
+    told.line("| scene | experiment | PSNR, dB | predicted PSNR, dB | seconds |");
+    told.line("|---|---|---|---|---|");
     let mut page = Page::new(&options.out)?;
     for (i, scene) in SCENES.iter().enumerate().filter(|(_, scene)| scene.name.contains(&options.scene)) {
         page.scene(scene.name);
@@ -104,16 +100,14 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
             let [psnr, predicted] = ["psnr_db", "predicted_psnr_db"]
                 .map(|key| of(key).map_or_else(|| "–".to_owned(), |value| format!("{value:.2}")));
             let seconds = of("seconds").context("the record has no seconds")?;
-            tell(format!("| {} | {config} | {psnr} | {predicted} | {seconds:.1} |", scene.name));
+            told.line(&format!("| {} | {config} | {psnr} | {predicted} | {seconds:.1} |", scene.name));
             let figures = format!("PSNR {psnr} dB, predicted {predicted} dB, {seconds:.1} s");
             page.run(config, &figures, &folder, &record)?;
         }
     }
     println!("wrote {}", page.write()?.display());
     if options.save {
-        let path = results_dir()?.join("real.md");
-        fs::write(&path, table).with_context(|| path.display().to_string())?;
-        println!("wrote {}", path.display());
+        told.save("real.md")?;
     }
     Ok(())
 }

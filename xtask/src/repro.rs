@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::workspace::{Sci, results_dir, root, shared};
+use crate::workspace::{Sci, Told, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -117,10 +117,10 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
         on_demo(table, &expected.tolerance)?
     } else {
         let shared = shared(options.shared.as_deref())?;
-        let (kept, off) = on_scenes(table, &expected.tolerance, &Sci::build(Some(&shared))?, &shared)?;
+        let (told, off) = on_scenes(table, &expected.tolerance, &Sci::build(Some(&shared))?, &shared)?;
         if options.save {
             let name = if options.table == Which::TableGray { "repro-gray.md" } else { "repro-color.md" };
-            fs::write(results_dir()?.join(name), kept)?;
+            told.save(name)?;
         }
         off
     };
@@ -165,16 +165,11 @@ fn on_demo(table: &Table, tolerance: &Tolerance) -> anyhow::Result<Vec<String>> 
 }
 
 /// Every row on every scene that is there: the table as printed, and what is off.
-fn on_scenes(table: &Table, tolerance: &Tolerance, sci: &Sci, shared: &Path) -> anyhow::Result<(String, Vec<String>)> {
+fn on_scenes(table: &Table, tolerance: &Tolerance, sci: &Sci, shared: &Path) -> anyhow::Result<(Told, Vec<String>)> {
     let mut off = Vec::new();
-    let mut kept = String::new();
-    // Rows take minutes: each is printed when it is there.
-    let mut tell = |line: String| {
-        println!("{line}");
-        kept += &(line + "\n");
-    };
-    tell("| algorithm | scene | published | ours | difference | SSIM, published | seconds a measurement |".into());
-    tell("|---|---|---|---|---|---|---|".into());
+    let mut told = Told::default();
+    told.line("| algorithm | scene | published | ours | difference | SSIM, published | seconds a measurement |");
+    told.line("|---|---|---|---|---|---|---|");
     let mut found = BTreeMap::new();
     for row in &table.row {
         for (i, scene) in table.scenes.iter().enumerate() {
@@ -184,11 +179,11 @@ fn on_scenes(table: &Table, tolerance: &Tolerance, sci: &Sci, shared: &Path) -> 
                 .map(|text| text.unwrap_or_else(|| "–".to_owned()));
             let named = format!("| {} | {} | {psnr}", row.name, scene.name);
             match cell(sci, shared, row, scene)? {
-                Err(lacking) => tell(format!("{named} | {lacking} | – | – ({ssim}) | – |")),
+                Err(lacking) => told.line(&format!("{named} | {lacking} | – | – ({ssim}) | – |")),
                 Ok(ours) => {
                     let Ours { psnr_db, ssim: own, seconds } = ours;
                     let off_by = published.map_or_else(|| "–".to_owned(), |v| format!("{:+.2}", psnr_db - v));
-                    tell(format!("{named} | {psnr_db:.2} | {off_by} | {own:.3} ({ssim}) | {seconds:.2} |"));
+                    told.line(&format!("{named} | {psnr_db:.2} | {off_by} | {own:.3} ({ssim}) | {seconds:.2} |"));
                     let expected = row.expected.get(&scene.name).copied();
                     off.extend(
                         expected.and_then(|e| tolerance.off(&format!("{} on {}", row.name, scene.name), &ours, e)),
@@ -200,10 +195,10 @@ fn on_scenes(table: &Table, tolerance: &Tolerance, sci: &Sci, shared: &Path) -> 
     }
     for row in &table.row {
         if let Some(line) = worse(row, &found) {
-            tell(format!("\n{line}"));
+            told.line(&format!("\n{line}"));
         }
     }
-    Ok((kept, off))
+    Ok((told, off))
 }
 
 /// What is to be said of a row that is worse than the one it extends.

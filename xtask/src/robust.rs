@@ -1,11 +1,10 @@
 //! `cargo xtask bench robust`: what the faults of a real camera cost, one at a time and together, and what calibration wins back.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
-use crate::workspace::{Sci, results_dir, root, shared};
+use crate::workspace::{Sci, Told, root, shared};
 
 #[derive(clap::Args)]
 pub(crate) struct Options {
@@ -65,18 +64,14 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
     let shared = shared(options.shared.as_deref())?;
     let sci = Sci::build(Some(&shared))?;
     let columns: Vec<Column> = columns().into_iter().filter(|column| column.head.contains(&options.config)).collect();
-    let mut kept = String::new();
-    let mut tell = |line: String| {
-        println!("{line}");
-        kept += &(line + "\n");
-    };
+    let mut told = Told::default();
     let scenes: Vec<_> = SCENES.iter().filter(|(scene, _)| scene.contains(&options.scene)).collect();
     let heads: Vec<String> = scenes
         .iter()
         .flat_map(|(scene, _)| columns.iter().map(move |column| format!("{scene}, {}", column.head)))
         .collect();
-    tell(format!("| PSNR in dB, first measurement | {} |", heads.join(" | ")));
-    tell(format!("|---{}|", "|---".repeat(heads.len())));
+    told.line(&format!("| PSNR in dB, first measurement | {} |", heads.join(" | ")));
+    told.line(&format!("|---{}|", "|---".repeat(heads.len())));
     for (name, sets, calibrates) in CONDITIONS.iter().filter(|(name, ..)| name.contains(&options.only)) {
         let mut cells = Vec::new();
         for (scene, column) in scenes.iter().flat_map(|scene| columns.iter().map(move |column| (scene, column))) {
@@ -85,14 +80,12 @@ pub(crate) fn run(options: &Options) -> anyhow::Result<()> {
                 false => format!("{:.2}", psnr(&sci, &shared, column, scene, sets).with_context(|| *name)?),
             });
         }
-        tell(format!("| {name} | {} |", cells.join(" | ")));
+        told.line(&format!("| {name} | {} |", cells.join(" | ")));
     }
     if options.save {
         let of = [&options.config, &options.scene].into_iter().filter(|part| !part.is_empty());
         let name = of.fold("robust".to_owned(), |name, part| format!("{name}-{}", part.replace('/', "-")));
-        let path = results_dir()?.join(name + ".md");
-        fs::write(&path, kept).with_context(|| path.display().to_string())?;
-        println!("wrote {}", path.display());
+        told.save(&(name + ".md"))?;
     }
     Ok(())
 }

@@ -48,6 +48,26 @@ pub(crate) fn results_dir() -> anyhow::Result<PathBuf> {
     Ok(dir)
 }
 
+/// A table whose lines are printed as soon as they are there, as each may take minutes.
+#[derive(Default)]
+pub(crate) struct Told(String);
+
+impl Told {
+    pub(crate) fn line(&mut self, line: &str) {
+        println!("{line}");
+        self.0 += line;
+        self.0.push('\n');
+    }
+
+    /// Keeps it in the folder of this machine's results, under this name.
+    pub(crate) fn save(&self, name: &str) -> anyhow::Result<()> {
+        let path = results_dir()?.join(name);
+        std::fs::write(&path, &self.0).with_context(|| path.display().to_string())?;
+        println!("wrote {}", path.display());
+        Ok(())
+    }
+}
+
 /// The commit that is checked out.
 pub(crate) fn revision() -> anyhow::Result<String> {
     Ok(output(Command::new("git").current_dir(root()).args(["rev-parse", "HEAD"]))?.trim().to_owned())

@@ -127,6 +127,12 @@ impl ShiftnetSpec {
         let colors = PHASES * self.channels;
         Body { ends: (self.window * colors + 1, colors), widths: self.widths, blocks: self.blocks }
     }
+
+    /// The frames that are shown for frame `t`, nothing before the first.
+    fn shown(self, t: usize) -> impl Iterator<Item = Option<usize>> {
+        let others: &[isize] = if self.window == 1 { &[0] } else { &[-1, 1, 0] };
+        others.iter().map(move |&offset| t.checked_add_signed(offset))
+    }
 }
 
 impl std::fmt::Display for ShiftnetSpec {
@@ -269,14 +275,6 @@ impl Shiftnet {
             first += clips.len();
         }
         Tensor::cat(&found, 0)
-    }
-}
-
-impl ShiftnetSpec {
-    /// The frames that are shown for frame `t`, nothing before the first.
-    fn shown(self, t: usize) -> impl Iterator<Item = Option<usize>> {
-        let others: &[isize] = if self.window == 1 { &[0] } else { &[-1, 1, 0] };
-        others.iter().map(move |&offset| t.checked_add_signed(offset))
     }
 }
 

@@ -311,6 +311,24 @@ mod tests {
         assert_eq!((frame.index_axis(Axis(0), 0), color), (whole.truth_of(1).unwrap().index_axis(Axis(0), 1), None));
     }
 
+    /// y without its masks is scaled as in a band, whatever it came in.
+    #[test]
+    fn a_whole_y_is_that_of_the_bands() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
+        npz.add_array("mask", &Array3::from_shape_fn((4, 20, 6), |(t, y, x)| ((t + y + x) % 2) as u8)).unwrap();
+        let y = Array3::from_shape_fn((2, 20, 6), |(k, y, x)| (100 + 40 * k + 7 * y + 11 * x) as u16);
+        npz.add_array("meas", &y).unwrap();
+        npz.finish().unwrap();
+        let mut reading = Reading::default();
+        reading.sensor.black = 64.0;
+        let mut banded = Banded::open(&path, &reading).unwrap().unwrap();
+        banded.decide(20).unwrap();
+        let (whole, band) = (banded.y(1).unwrap(), banded.band(1, 0..20).unwrap());
+        assert!(whole.iter().zip(band.y(0)).all(|(a, b)| (a - b).abs() <= 1e-6 * b.abs()), "{whole} {}", band.y(0));
+    }
+
     #[test]
     fn empty_and_short_arrays_are_errors() {
         for (masks, frames, said) in
