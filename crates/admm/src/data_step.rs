@@ -41,8 +41,8 @@ impl Progress {
 /// to = from + Hᵀ (t − H p) / (diag(H Hᵀ) + damping + precision · variance)
 /// ```
 ///
-/// with the target `t = y`, or with momentum (accelerated GAP) `y1 ← y1 + (y − H from)`, `t = y1`, at the point `p = from`, or
-/// with a mirror z (ADMM) `p = 2 from − z`. `damping = 0` with `p = from` projects onto `{x : H x = t}`; `damping = γ > 0` solves
+/// with the target `t = y`, or with momentum (accelerated GAP) `y1 ← y1 + s (y − H from)`, `t = y1`, at the point `p = from`, s being
+/// diag(H Hᵀ) over the divisor, or with a mirror z (ADMM) `p = 2 from − z`. `damping = 0` with `p = from` projects onto `{x : H x = t}`; `damping = γ > 0` solves
 /// `argmin_x ‖y − H x‖² + γ‖x − from‖²` (paper, Eq. `qv_k+1`). With the variance n of the measurement's noise
 /// ([`Measurement::variance`]) and `from` known to a variance of s², `precision = 1/s²` gives the likeliest x,
 /// `argmin_x Σ (y − H x)²/n + ‖x − from‖²/s²`. A clipped pixel ([`Measurement::with_clip`]) is left alone by a video that gives it as
@@ -72,8 +72,6 @@ pub struct DataStep<'a> {
     pub precision: f32,
     /// The accumulated measurement `y1` `[H, W]` of accelerated GAP, in row-major order, updated in place.
     pub momentum: Option<&'a mut Array2<f32>>,
-    /// Leaves `y1` as it is: what is left of the residual is noise, not to be added up.
-    pub hold_momentum: bool,
     /// z `[T, H, W]`, if the step is taken at `2 from − z`.
     pub mirror: Option<ArrayView3<'a, f32>>,
     /// The iterate before `from`, `[T, H, W]`, if its change is wanted.
@@ -105,7 +103,7 @@ impl DataStep<'_> {
         from: ArrayView3<'_, f32>,
         mut to: ArrayViewMut3<'_, f32>,
     ) -> Progress {
-        let Self { damping, precision, momentum, hold_momentum, mirror, previous } = self;
+        let Self { damping, precision, momentum, mirror, previous } = self;
         let variance = measurement.variance().filter(|_| precision > 0.0);
         let previous = previous.unwrap_or(from);
         let (y, gram, width) = (measurement.y(), measurement.operator().gram(), measurement.shape().width);
@@ -134,7 +132,6 @@ impl DataStep<'_> {
                             variance: variance.map(|variance| packed(variance.index_axis_move(Axis(0), row))),
                             damping,
                             precision,
-                            hold_momentum,
                         },
                     };
                     let y1 = y1.as_mut().map(|y1| &mut y1[i * width..][..width]);
@@ -153,7 +150,7 @@ impl DataStep<'_> {
         from: ArrayView3<'_, f32>,
         mut to: ArrayViewMut3<'_, f32>,
     ) -> Progress {
-        let Self { damping, precision, momentum, hold_momentum, mirror, previous } = self;
+        let Self { damping, precision, momentum, mirror, previous } = self;
         let operator = measurement.operator();
         let progress = progress(measurement, from, previous.unwrap_or(from));
         let mut h = operator.forward(from);
@@ -162,16 +159,17 @@ impl DataStep<'_> {
             None => h.clone(),
         };
         let level = measurement.clip();
-        let of_all = Zip::from(&mut h).and(measurement.y()).and(&point);
-        match momentum {
-            Some(y1) => of_all.and(y1).for_each(|h, &y, &point, y1| {
-                *h = difference(point, y, Some(y1), hold_momentum, level);
-            }),
-            None => of_all.for_each(|h, &y, &point| *h = difference(point, y, None, hold_momentum, level)),
-        }
         let mut divisor = operator.gram().mapv(|gram| if gram > 0.0 { gram + damping } else { f32::INFINITY });
         if let Some(variance) = measurement.variance() {
             divisor.zip_mut_with(&variance, |divisor, &variance| *divisor += precision * variance);
+        }
+        let share = &operator.gram() / &divisor;
+        let of_all = Zip::from(&mut h).and(measurement.y()).and(&point);
+        match momentum {
+            Some(y1) => of_all.and(y1).and(&share).for_each(|h, &y, &point, y1, &share| {
+                *h = difference(point, y, Some((y1, share)), level);
+            }),
+            None => of_all.for_each(|h, &y, &point| *h = difference(point, y, None, level)),
         }
         h /= &divisor;
         operator.adjoint_into(h.view(), to.view_mut());
@@ -247,7 +245,6 @@ struct Target<'a> {
     variance: Option<Cow<'a, [f32]>>,
     damping: f32,
     precision: f32,
-    hold_momentum: bool,
 }
 
 /// What the step of one row reads; the videos' rows are `[T, W]`.
@@ -295,7 +292,7 @@ impl Row<'_> {
             let columns = start..(start + CHUNK).min(width);
             let count = columns.len();
             self.read(start, count, chunk, &mut norms);
-            let Target { gram, y, measurement, hold_momentum, .. } = &self.target;
+            let Target { gram, y, measurement, .. } = &self.target;
             let (gram, y) = (&gram[columns.clone()], &y[columns.clone()]);
             let (hx, divisor) = (&mut chunk.hx[..count], &mut chunk.divisor[..count]);
             self.target.divisor(columns.clone(), divisor);
@@ -305,7 +302,7 @@ impl Row<'_> {
                 residual += squared_residual(hx, &chunk.y[..count], gram);
                 let y1 = y1.as_deref_mut().map(|y1| &mut y1[columns.clone()]);
                 let hz = chunk.hz.as_ref().map(|hz| &hz[..count]);
-                one_sided_coefficients(hx, hz, y, y1, *hold_momentum, level, divisor);
+                one_sided_coefficients(hx, hz, y, y1, gram, level, divisor);
             } else {
                 residual += squared_residual(hx, y, gram);
                 self.whole_coefficients(columns.clone(), hx, chunk.hz.as_deref(), y1.as_deref_mut(), divisor);
@@ -333,10 +330,9 @@ impl Row<'_> {
         y1: Option<&mut [f32]>,
         divisor: &[f32],
     ) {
-        let y = &self.target.y[columns.clone()];
+        let (y, gram) = (&self.target.y[columns.clone()], &self.target.gram[columns.clone()]);
         match (y1, hz) {
-            (Some(y1), _) if self.target.hold_momentum => coefficients(hx, &y1[columns], divisor),
-            (Some(y1), _) => accelerated_coefficients(hx, y, divisor, &mut y1[columns]),
+            (Some(y1), _) => accelerated_coefficients(hx, y, gram, divisor, &mut y1[columns]),
             (None, Some(hz)) => mirrored_coefficients(hx, &hz[..y.len()], y, divisor),
             (None, None) => coefficients(hx, y, divisor),
         }
@@ -409,27 +405,25 @@ fn one_sided_coefficients(
     hz: Option<&[f32]>,
     y: &[f32],
     mut y1: Option<&mut [f32]>,
-    hold_momentum: bool,
+    gram: &[f32],
     level: f32,
     divisor: &[f32],
 ) {
     for i in 0..hx.len() {
         let point = hz.map_or(hx[i], |hz| 2.0 * hx[i] - hz[i]);
-        let y1 = y1.as_deref_mut().map(|y1| &mut y1[i]);
-        hx[i] = difference(point, y[i], y1, hold_momentum, Some(level)) / divisor[i];
+        let y1 = y1.as_deref_mut().map(|y1| (&mut y1[i], gram[i] / divisor[i]));
+        hx[i] = difference(point, y[i], y1, Some(level)) / divisor[i];
     }
 }
 
-/// `t − H p` of a pixel; what a clipped pixel asks for, and what it has asked for in y1 beyond y, is never negative: a constraint `H x ≥ y`
+/// `t − H p` of a pixel, whose y1 adds up a share of `y − H p`; what a clipped pixel asks for, and what it has asked for in y1 beyond y, is never negative: a constraint `H x ≥ y`
 /// and its multiplier.
-fn difference(point: f32, y: f32, y1: Option<&mut f32>, hold_momentum: bool, level: Option<f32>) -> f32 {
+fn difference(point: f32, y: f32, y1: Option<(&mut f32, f32)>, level: Option<f32>) -> f32 {
     let clipped = level.is_some_and(|level| y >= level);
     let one_sided = |v: f32| if clipped { v.max(0.0) } else { v };
-    let Some(y1) = y1 else { return one_sided(y - point) };
-    if !hold_momentum {
-        *y1 += y - point;
-        *y1 = if clipped { y1.max(y) } else { *y1 };
-    }
+    let Some((y1, share)) = y1 else { return one_sided(y - point) };
+    *y1 += share * (y - point);
+    *y1 = if clipped { y1.max(y) } else { *y1 };
     one_sided(*y1 - point)
 }
 
@@ -449,11 +443,11 @@ fn mirrored_coefficients(hx: &mut [f32], hz: &[f32], y: &[f32], divisor: &[f32])
     }
 }
 
-/// As [`coefficients`], but adds `y − H x` to `y1` and aims at that.
+/// As [`coefficients`], but adds the share `gram / divisor` of `y − H x` to `y1` and aims at that.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn accelerated_coefficients(hx: &mut [f32], y: &[f32], divisor: &[f32], y1: &mut [f32]) {
-    for (((hx, y), divisor), y1) in hx.iter_mut().zip(y).zip(divisor).zip(y1) {
-        *y1 += y - *hx;
+fn accelerated_coefficients(hx: &mut [f32], y: &[f32], gram: &[f32], divisor: &[f32], y1: &mut [f32]) {
+    for ((((hx, y), gram), divisor), y1) in hx.iter_mut().zip(y).zip(gram).zip(divisor).zip(y1) {
+        *y1 += gram / divisor * (y - *hx);
         *hx = (*y1 - *hx) / divisor;
     }
 }

@@ -188,12 +188,11 @@ fn paper_by_definition(
     let (y, gram) = (flat(problem.y().to_owned()), flat(h.gram().to_owned()));
     let noise = problem.variance().map(|n| flat(n.to_owned()));
     let (mut b, mut w, mut v) = (Array1::<f64>::zeros(32), Array1::<f64>::zeros(96), Array1::<f64>::zeros(96));
-    let mut theta = start.mapv(f64::from).flatten().to_owned();
+    let (mut theta, mut mse) = (start.mapv(f64::from).flatten().to_owned(), 0.0);
     for k in 0..3 {
         let damping = noise.as_ref().map_or(Array1::from_elem(16, rho), |n| {
             let residual = &y - &hm.dot(&theta);
-            let open: f64 = n.iter().zip(&gram).map(|(n, gram)| if *gram > 0.0 { *n } else { 0.0 }).sum();
-            let mse = ((residual.dot(&residual) - open) / gram.sum()).max(6e-6);
+            mse = (residual.dot(&residual) / gram.sum()).max(0.7 * mse);
             n / mse + rho
         });
         let p = &theta - &b / rho;

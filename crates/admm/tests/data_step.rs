@@ -74,7 +74,7 @@ proptest! {
     #[test]
     fn the_fused_step_equals_the_definition(
         shape in shapes(), seed in any::<u64>(), damping in prop_oneof![Just(0f32), 0.01f32..2.0], hole in any::<bool>(),
-        (noisy, precision, hold_momentum) in (any::<bool>(), 0f32..100.0, any::<bool>()),
+        (noisy, precision) in (any::<bool>(), 0f32..100.0),
         clip in prop_oneof![Just(None), (0.5f32..2.0).prop_map(Some)]
     ) {
         let noise = noisy.then(|| Noise::new(Some(50.0), 0.1).unwrap());
@@ -88,7 +88,7 @@ proptest! {
                     let momentum = (kind == 1).then_some(&mut y1);
                     let mirror = (kind == 2).then(|| z.view());
                     let previous = Some(previous.view());
-                    let step = DataStep { damping, precision, momentum, hold_momentum, mirror, previous };
+                    let step = DataStep { damping, precision, momentum, mirror, previous };
                     let progress = step.apply(measurement, x.view(), to.view_mut());
                     (to, y1, progress)
                 };

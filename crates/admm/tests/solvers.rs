@@ -3,7 +3,7 @@
 use admm::*;
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView4, ArrayViewMut4, Axis};
 use ndarray_npy::NpzReader;
-use sci_forward::testing::{moving_square, uniform};
+use sci_forward::testing::{gaussian, moving_square, uniform};
 use sci_forward::{MaskOperator, MaskStack, Measurement, MeasurementError, SensingOperator, VideoShape};
 use std::ops::ControlFlow;
 use std::sync::{Arc, Mutex};
@@ -85,13 +85,33 @@ fn admm_with_known_noise_reaches_its_exact_fixed_point() {
     let residual = &problem.y() - &operator.forward(found.view());
     let sum = |values: &Array2<f32>| values.iter().map(|&v| f64::from(v)).sum::<f64>();
     let open = operator.gram().mapv(|gram| if gram > 0.0 { 1.0 } else { 0.0 });
-    let beyond = sum(&(&residual * &residual * &open)) - sum(&(&variance * &open));
-    let mse = (beyond / sum(&operator.gram().to_owned())) as f32;
-    assert!(mse > 1e-4, "the residual is more than noise here: {mse}");
+    let mse = (sum(&(&residual * &residual * &open)) / sum(&operator.gram().to_owned())) as f32;
     let mu = variance.mapv(|n| (gamma + n / mse) * lambda);
     let exact = operator.adjoint((&problem.y() / &(&operator.gram() + &mu)).view());
     let worst = (found - exact).fold(0f32, |m, d| m.max(d.abs()));
     assert!(worst < 2e-5, "largest difference {worst}");
+}
+
+/// Whatever noise is told, also far too little: what is left of the residual is not added up for ever.
+#[test]
+fn accelerated_gap_is_safe_where_noise_is_told_wrongly() {
+    let truth = moving_square(SHAPE);
+    let noise = gaussian(SHAPE.image_dim(), 3) * 0.2;
+    let problem = Measurement::new(operator(), &noise + &measurement().y()).unwrap();
+    let error = |told: Option<f64>, iterations: usize| {
+        let told = told.map(|read| sci_forward::Noise::new(None, read).unwrap());
+        let problem = problem.clone().with_noise(told);
+        let mut solver = Gap::accelerated(Tv::new(0.3));
+        let outcome = run(&mut solver, &problem, Start::Adjoint, &stages(iterations), &mut ()).unwrap();
+        rms(&outcome.estimate.sensor, &truth)
+    };
+    let untold = error(None, 40);
+    for told in [0.1, 0.14, 0.17, 0.2, 0.28] {
+        for iterations in [39, 40, 80] {
+            let error = error(Some(told), iterations);
+            assert!(error < untold, "{told} told, {iterations} iterations: {error}, untold {untold}");
+        }
+    }
 }
 
 /// With the identity as prior, GAP is a projection: one step reaches `{x : H x = y}`, and further steps stay.

@@ -16,7 +16,7 @@ use sci_forward::Measurement;
 /// The estimate is `θ`, not clipped. `γ = 0` with `b = 0` is plain GAP.
 ///
 /// Where noise of variance n is known of ([`Measurement::with_noise`]), y is not explained more closely than it allows: diag(H Hᵀ) + γ becomes
-/// diag(H Hᵀ) + γ + n / mse(θ), the error of θ being what its residual has beyond the noise.
+/// diag(H Hᵀ) + γ + n / mse(θ), the error of θ being told by its residual.
 ///
 /// All that is kept between iterations is `z = x − b`, the prior's input: with it `b = θ − z`, so that the data step and both
 /// subtractions are one pass, `z ← θ + Hᵀ (y − H (2θ − z)) / (diag(H Hᵀ) + γ)` (Douglas and Rachford's form of ADMM).
@@ -28,6 +28,7 @@ use sci_forward::Measurement;
 pub struct Admm<P> {
     prior: P,
     gamma: f32,
+    known: Known,
     /// z `[T, H, W]`, and the memory for the next.
     z: Array3<f32>,
     next_z: Array3<f32>,
@@ -40,14 +41,15 @@ impl<P: Prior> Admm<P> {
     /// If γ is negative or not finite.
     pub fn new(prior: P, gamma: f32) -> Self {
         assert!(gamma >= 0.0 && gamma.is_finite(), "γ = {gamma} must be finite and at least 0");
-        Self { prior, gamma, z: Array3::zeros((0, 0, 0)), next_z: Array3::zeros((0, 0, 0)) }
+        let (z, next_z) = (Array3::zeros((0, 0, 0)), Array3::zeros((0, 0, 0)));
+        Self { prior, gamma, known: Known::default(), z, next_z }
     }
 
     /// The z after θ, and how far θ has come.
     fn data_step(&mut self, measurement: &Measurement, previous: &Estimate, theta: &Estimate) -> Progress {
-        let Self { gamma, z, next_z, .. } = self;
+        let Self { gamma, known, z, next_z, .. } = self;
         let previous = Some(previous.sensor.view());
-        let precision = Known::of(measurement, theta.sensor.view()).precision;
+        let precision = known.precision(measurement, theta.sensor.view());
         let step = DataStep { damping: *gamma, precision, mirror: Some(z.view()), previous, ..DataStep::default() };
         let progress = step.apply(measurement, theta.sensor.view(), next_z.view_mut());
         std::mem::swap(z, next_z);
@@ -57,6 +59,7 @@ impl<P: Prior> Admm<P> {
 
 impl<P: Prior> Solver for Admm<P> {
     fn start(&mut self, measurement: &Measurement, from: &Estimate) {
+        self.known = Known::default();
         // With b = 0 the mirror is θ itself.
         self.z = from.sensor.clone();
         self.next_z = Array3::zeros(from.sensor.dim());

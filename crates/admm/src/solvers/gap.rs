@@ -22,8 +22,8 @@ pub enum MomentumStart {
 /// ```
 ///
 /// Where noise of variance n is known of ([`Measurement::with_noise`]), x is the likeliest video instead of the projection:
-/// diag(H Hᵀ) becomes diag(H Hᵀ) + n / mse(v), the error of v being what its residual has beyond the noise, and y1 stays as it is
-/// once the residual is within the noise, which it would add up.
+/// diag(H Hᵀ) becomes diag(H Hᵀ) + n / mse(v), the error of v being told by its residual, and y1 adds up that share of y − H v only
+/// that the step takes: diag(H Hᵀ) of the divisor. The rest is noise.
 ///
 /// The estimate is `v`, not clipped. On a color sensor x and v are mosaics, and the prior knows an RGB video behind v.
 ///
@@ -35,6 +35,7 @@ pub struct Gap<P> {
     prior: P,
     momentum: Option<MomentumStart>,
     restarts: bool,
+    known: Known,
     /// The projection x `[T, H, W]` of v, the prior's next input.
     x: Array3<f32>,
     /// The accumulated measurement y1 `[H, W]`.
@@ -49,7 +50,8 @@ const GENTLE: f32 = 0.7;
 impl<P: Prior> Gap<P> {
     /// Plain GAP.
     pub fn plain(prior: P) -> Self {
-        Self { prior, momentum: None, restarts: false, x: Array3::zeros((0, 0, 0)), y1: None, sigma: None }
+        let x = Array3::zeros((0, 0, 0));
+        Self { prior, momentum: None, restarts: false, known: Known::default(), x, y1: None, sigma: None }
     }
 
     /// Accelerated GAP with `y1` starting at `y`.
@@ -73,10 +75,9 @@ impl<P: Prior> Gap<P> {
 
     /// The x of the next iteration from the v of this one. Without noise it reads v once for the projection and for how far v has come.
     fn project(&mut self, measurement: &Measurement, previous: &Estimate, v: &Estimate) -> Progress {
-        let Known { precision, within_noise } = Known::of(measurement, v.sensor.view());
+        let precision = self.known.precision(measurement, v.sensor.view());
         let step = DataStep {
             momentum: self.y1.as_mut(),
-            hold_momentum: within_noise,
             precision,
             previous: Some(previous.sensor.view()),
             ..DataStep::default()
@@ -105,7 +106,7 @@ impl<P: Prior> Solver for Gap<P> {
             MomentumStart::Zero => Array2::zeros(measurement.y().dim()),
             MomentumStart::Measurement => measurement.y().to_owned(),
         });
-        self.sigma = None;
+        (self.sigma, self.known) = (None, Known::default());
         if self.x.dim() != from.sensor.dim() {
             self.x = Array3::zeros(from.sensor.dim());
         }

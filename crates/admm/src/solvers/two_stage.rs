@@ -92,6 +92,7 @@ pub struct TwoStage<D, M> {
 struct Kept {
     /// Whether no step was taken yet.
     first: bool,
+    known: Known,
     /// T x where that closes the loop instead of θ.
     tx: Option<Array3<f32>>,
     q: Array3<f32>,
@@ -123,6 +124,7 @@ impl<D: Denoiser, M: Demosaicer> TwoStage<D, M> {
         let scaled = self.params.convention == Convention::Scaled;
         Kept {
             first: true,
+            known: Known::default(),
             tx: (scaled && closed_form).then(|| from.sensor.clone()),
             q: zeros.clone(),
             b: zeros.clone(),
@@ -147,10 +149,10 @@ impl Kept {
     /// q, and the mosaic q + b that is demosaicked.
     fn data_step(&mut self, measurement: &Measurement, params: TwoStageParams, theta: &Array3<f32>) {
         let (b_scale, _) = params.dual_scales();
-        let Self { tx, q, b, mosaic, .. } = self;
+        let Self { known, tx, q, b, mosaic, .. } = self;
         let closing = tx.as_ref().unwrap_or(theta);
         Zip::from(&mut *mosaic).and(closing).and(&*b).par_for_each(|p, &closing, &b| *p = closing - b / b_scale);
-        let precision = Known::of(measurement, theta.view()).precision;
+        let precision = known.precision(measurement, theta.view());
         let step = DataStep { damping: params.rho, precision, ..DataStep::default() };
         step.apply(measurement, mosaic.view(), q.view_mut());
         Zip::from(&mut *mosaic).and(&*q).and(&*b).par_for_each(|m, &q, &b| *m = q + b / b_scale);
