@@ -241,6 +241,32 @@ impl LayerSpec {
     }
 }
 
+/// A tensor of a smaller body (`weight`) within the one of a larger, untrained body (`own`): its channels keep their way through the shift in
+/// time, and do not listen to the new ones. What the first layer is shown grows at its beginning.
+pub(super) fn widened(own: &Tensor, weight: &Tensor, is_first: bool) -> Result<Tensor> {
+    let size = |tensor: &Tensor, axis: usize| tensor.dims().get(axis).copied().unwrap_or(1);
+    let (has, wants) = ([0, 1].map(|axis| size(weight, axis)), [0, 1].map(|axis| size(own, axis)));
+    let kernel = own.elem_count() / (wants[0] * wants[1]);
+    let old: Vec<f32> = weight.flatten_all()?.to_vec1()?;
+    let mut new: Vec<f32> = own.flatten_all()?.to_vec1()?;
+    for output in 0..has[0] {
+        let row = &mut new[place(output, has[0], wants[0]) * wants[1] * kernel..][..wants[1] * kernel];
+        row.fill(0.0);
+        for input in 0..has[1] {
+            let to = if is_first { wants[1] - has[1] + input } else { place(input, has[1], wants[1]) };
+            row[to * kernel..][..kernel].copy_from_slice(&old[(output * has[1] + input) * kernel..][..kernel]);
+        }
+    }
+    Ok(Tensor::from_vec(new, own.dims(), own.device())?)
+}
+
+/// Where channel `c` of `old` stands among `new`: those from the frame before, those from the frame after and the others begin with the old ones.
+fn place(c: usize, old: usize, new: usize) -> usize {
+    let (old, new) = (TemporalShift::each_way(old), TemporalShift::each_way(new));
+    let group = (c / old.max(1)).min(2);
+    group * new + c - group * old
+}
+
 /// The residual block of the layers `first` and the one after it, frame by frame.
 fn add_block(engine: &mut Engine, first: usize, h: &mut [Blocked]) -> Result<()> {
     // The frame before, as it was before the block.

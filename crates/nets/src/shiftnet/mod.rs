@@ -306,18 +306,17 @@ impl Layers for Shiftnet {
         self.convs.iter_mut().collect()
     }
 
-    /// Experts that are lacking begin as the first one, frames that it was not shown as nothing.
+    /// Experts that are lacking begin as the first one, frames that it was not shown as nothing; channels that are lacking begin at random and
+    /// are not listened to.
     fn grow(&self, weights: &mut BTreeMap<String, Tensor>) -> Result<()> {
         for (name, own) in self.state() {
             let plain = name.split_once('.').filter(|(first, _)| first.starts_with("below")).map(|(_, rest)| rest);
-            let Some(weight) = weights.get(&name).or_else(|| weights.get(plain?)).cloned() else { continue };
-            let lacking = own.dims().get(1).zip(weight.dims().get(1)).map_or(0, |(own, has)| own.saturating_sub(*has));
-            let weight = if name.ends_with("body.input.weight") && lacking > 0 {
-                let (outputs, _, rows, columns) = own.dims4()?;
-                let unseen = Tensor::zeros((outputs, lacking, rows, columns), own.dtype(), own.device())?;
-                Tensor::cat(&[&unseen, &weight], 1)?
-            } else {
-                weight
+            let Some(weight) = weights.get(&name).or_else(|| weights.get(plain?)) else { continue };
+            let smaller =
+                weight.rank() == own.rank() && weight.dims().iter().zip(own.dims()).all(|(has, own)| has <= own);
+            let weight = match smaller && weight.dims() != own.dims() {
+                true => body::widened(&own, weight, name.ends_with("body.input.weight"))?,
+                false => weight.clone(),
             };
             weights.insert(name, weight);
         }
@@ -456,6 +455,29 @@ mod tests {
         for sigma in [0.2, 0.02] {
             let (small, grown) = (forward(&small, noisy.view(), &[sigma]), forward(&grown, noisy.view(), &[sigma]));
             assert!(difference(&small, &noisy) > 1e-3 && difference(&small, &grown) < 1e-5);
+        }
+    }
+
+    #[test]
+    fn a_widened_network_is_the_one_that_it_began_as() {
+        let small = loud(1);
+        let spec = ShiftnetSpec { widths: [32, 48, 64], ..small.spec() };
+        let mut wide = Shiftnet::random(spec, 1).unwrap();
+        let mut weights = small.state();
+        wide.grow(&mut weights).unwrap();
+        wide.set_state(&weights).unwrap();
+        let noisy = clip((3, 1, 8, 16), 11);
+        for sigma in [0.2, 0.1, 0.02] {
+            let (small, wide) = (forward(&small, noisy.view(), &[sigma]), forward(&wide, noisy.view(), &[sigma]));
+            assert!(difference(&small, &noisy) > 1e-3 && difference(&small, &wide) < 1e-5);
+        }
+        let unused = |(name, tensor): (&String, &Tensor)| {
+            name.ends_with("enter0.0.0.weight")
+                .then(|| tensor.abs().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap())
+        };
+        let (before, after) = (small.state(), wide.state());
+        for (before, after) in before.iter().filter_map(unused).zip(after.iter().filter_map(unused)) {
+            assert!(after > 1.5 * before, "new channels are not silent: {before} {after}");
         }
     }
 
