@@ -205,7 +205,7 @@ fn large_experiments_run_to_the_end_in_their_memory() {
     let bench = Bench::new();
     write_scene(&bench, (4, 1000, 96), "rgb");
     let path = format!("data.path={}", bench.path("scene.npz").display());
-    let learning: &[&str] = &["online.side=32", "online.updates=2", "online.judged_crops=2"];
+    let learning: &[&str] = &["online.side=32", "online.crops=1", "online.updates=2", "online.judged_crops=2"];
     let experiments: [(&str, u64, &[&str]); 4] = [
         ("gap-tv", 128, &[]),
         ("gap-ffdnet", 128, &["denoiser.weights=bundled:ffdnet_color"]),
