@@ -210,7 +210,7 @@ fn large_experiments_run_to_the_end_in_their_memory() {
         ("gap-tv", 128, &[]),
         ("gap-ffdnet", 128, &["denoiser.weights=bundled:ffdnet_color"]),
         ("fast", 160, &[]),
-        ("adaptive", 300, learning),
+        ("adaptive", 200, learning),
     ];
     let shipped = fs::read_dir(workspace().join("configs/large")).unwrap();
     assert_eq!(shipped.count(), experiments.len(), "each of configs/large is run");
