@@ -163,12 +163,14 @@ impl DataStep<'_> {
         if let Some(variance) = measurement.variance() {
             divisor.zip_mut_with(&variance, |divisor, &variance| *divisor += precision * variance);
         }
-        let share = &operator.gram() / &divisor;
         let of_all = Zip::from(&mut h).and(measurement.y()).and(&point);
         match momentum {
-            Some(y1) => of_all.and(y1).and(&share).for_each(|h, &y, &point, y1, &share| {
-                *h = difference(point, y, Some((y1, share)), level);
-            }),
+            Some(y1) => {
+                let share = &operator.gram() / &divisor;
+                of_all.and(y1).and(&share).for_each(|h, &y, &point, y1, &share| {
+                    *h = difference(point, y, Some((y1, share)), level);
+                });
+            }
             None => of_all.for_each(|h, &y, &point| *h = difference(point, y, None, level)),
         }
         h /= &divisor;
@@ -416,8 +418,8 @@ fn one_sided_coefficients(
     }
 }
 
-/// `t − H p` of a pixel, whose y1 adds up a share of `y − H p`; what a clipped pixel asks for, and what it has asked for in y1 beyond y, is never negative: a constraint `H x ≥ y`
-/// and its multiplier.
+/// `t − H p` of a pixel, whose y1 adds up a share of `y − H p`; what a clipped pixel asks for, and what it has asked for in y1 beyond y,
+/// is never negative: a constraint `H x ≥ y` and its multiplier.
 fn difference(point: f32, y: f32, y1: Option<(&mut f32, f32)>, level: Option<f32>) -> f32 {
     let clipped = level.is_some_and(|level| y >= level);
     let one_sided = |v: f32| if clipped { v.max(0.0) } else { v };
