@@ -133,6 +133,21 @@ fn splitting_learns_once_from_all_measurements_before_the_first() {
     }
 }
 
+/// The network that adapts, another, and the first again.
+const RETURNS: &str = "stage=[{sigma=9,iterations=1},{denoiser={kind=\"tv\"},iterations=1},{sigma=9,iterations=1}]";
+
+/// What a network is adapted to are its own calls, wherever the solve goes on from there.
+#[test]
+fn another_denoiser_may_take_over_from_the_one_that_learns() {
+    let bench = bench();
+    let alone = run(&bench, "alone", &[SPLIT, "stage=[{sigma=9,iterations=2}]"]);
+    let followed =
+        run(&bench, "followed", &[SPLIT, "stage=[{sigma=9,iterations=2},{denoiser={kind=\"tv\"},iterations=2}]"]);
+    let learned = |record: &Value| record["measurements"][0]["online"]["split"]["judgements"].clone();
+    assert_eq!(learned(&followed), learned(&alone));
+    assert_ne!(psnr(&followed), psnr(&alone));
+}
+
 #[test]
 fn splitting_wants_one_solve_to_learn_through() {
     let bench = bench();
@@ -140,7 +155,8 @@ fn splitting_wants_one_solve_to_learn_through() {
         ("solver.kind=\"admm\"", "`solver.kind` is another"),
         ("solver.momentum=\"zero\"", "`solver.momentum` is zero"),
         ("solver.start=\"adjoint\"", "`solver.start` is another"),
-        ("stage=[{sigma=9,iterations=1},{denoiser={kind=\"tv\"},iterations=1}]", "`denoiser` is another"),
+        ("stage=[{denoiser={kind=\"tv\"},iterations=1},{sigma=9,iterations=1}]", "`denoiser` is another"),
+        (RETURNS, "`denoiser` is another"),
         ("online.interval=2", "`online.interval` has no effect without online.loss"),
     ] {
         let run = bench.sci(&["run", "a.toml", "--out", "no", "--set", SPLIT, "--set", set]);

@@ -70,7 +70,7 @@ fn a_network_is_given_the_sigmas_that_auto_stands_for() {
 #[test]
 fn tv_goes_first_only_once() {
     let bench = Bench::new();
-    let config = on_the_demo("gray/default.toml", RANDOM).replace("gray_sci", "gray");
+    let config = on_the_demo("gray/fastdvdnet.toml", RANDOM).replace("gray_sci", "gray");
     std::fs::write(bench.path("default.toml"), config).unwrap();
     let iterations_of_tv = |solver: &str| {
         let stages = "stage=[{sigma=20,iterations=2}]";
@@ -87,7 +87,7 @@ fn tv_goes_first_only_once() {
 #[test]
 fn the_sigmas_of_a_network_for_iterates_are_not_passed_over() {
     let bench = Bench::new();
-    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml", RANDOM)).unwrap();
+    std::fs::write(bench.path("default.toml"), on_the_demo("gray/fastdvdnet.toml", RANDOM)).unwrap();
     // Far above what is left of the error after the start.
     let stages = "stage=[{sigma=100,iterations=1},{sigma=50,iterations=1},{sigma=7,iterations=1}]";
     let sigmas = |overshoot: &[&str]| -> Vec<i64> {
@@ -104,7 +104,7 @@ fn the_sigmas_of_a_network_for_iterates_are_not_passed_over() {
 #[test]
 fn what_the_default_cannot_do_with_its_network_is_refused() {
     let bench = Bench::new();
-    std::fs::write(bench.path("default.toml"), on_the_demo("gray/default.toml", RANDOM)).unwrap();
+    std::fs::write(bench.path("default.toml"), on_the_demo("gray/fastdvdnet.toml", RANDOM)).unwrap();
     let auto = ["skip.enabled=true", "stage=[{sigma=\"auto\",iterations=4}]"];
     let trained = ["stage.0.sigma", "\"auto\"", "trained for the σ of its schedule"];
     let flips = ["[online]", "denoiser.flips = false", "online.enabled = false"];

@@ -40,10 +40,10 @@ fn hadamard((t, y, x): (usize, usize, usize)) -> bool {
     (row & column).count_ones().is_multiple_of(2)
 }
 
-/// PSNR in the schedule that `gray/default.toml` has for the trained denoiser.
+/// PSNR in the schedule that `gray/fastdvdnet.toml` has for the trained denoiser.
 fn psnr(bench: &Bench, mask: &str, weights: &str) -> f64 {
     let mask = format!("kind = \"file\"\npath = \"{mask}.npy\"");
-    bench.write("scene.toml", on_the_demo("gray/default.toml", &mask));
+    bench.write("scene.toml", on_the_demo("gray/fastdvdnet.toml", &mask));
     let set = format!("denoiser.weights=bundled:{weights}");
     let run = bench.sci(&[
         "run",

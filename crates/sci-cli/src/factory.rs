@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use admm::{Observer, Outcome, Plan, Prior, Start, StopRule, Tv};
 use ndarray::ArrayView3;
-use nets::kernels::{Isa, Precision};
+use nets::kernels::{Isa, Precision, release_freed_memory};
 use online::{Reuse, Sequence, SplitRecord, Task, Update, UpdateCounts};
 use sci_forward::{CfaPattern, Measurement};
 
@@ -166,6 +166,8 @@ impl<'e> Factory<'e> {
         let mut watch = |updates| observer.adaptation(updates);
         let first = self.learning().next();
         let record = first.map(|(net, _)| net.adapt_by_splitting(&measurements, recipe, &mut watch)).transpose()?;
+        // The solve is to have it: in bands of a large scene it needs all there is.
+        release_freed_memory();
         Ok(record.flatten())
     }
 

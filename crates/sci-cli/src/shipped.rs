@@ -15,11 +15,11 @@ macro_rules! shipped {
 
 /// Every one, with its text.
 const SHIPPED: &[(&str, &str)] = shipped! {
-    "color/adaptive" "color/default" "color/desci" "color/fast" "color/gap-fastdvdnet" "color/gap-ffdnet" "color/gap-tv" "color/gap-wavelet" "color/refined"
+    "color/adaptive" "color/default" "color/desci" "color/fast" "color/fastdvdnet" "color/gap-fastdvdnet" "color/gap-ffdnet" "color/gap-tv" "color/gap-wavelet" "color/refined"
     "color/two-stage-fastdvdnet-ddnet" "color/two-stage-fastdvdnet-ddnet-online-reuse" "color/two-stage-ffdnet"
     "color/two-stage-ffdnet-cfd" "color/two-stage-ffdnet-ddnet" "color/two-stage-ffdnet-fast" "color/two-stage-ffdnet-online"
     "color/two-stage-ffdnet-online-ddnet" "color/two-stage-ffdnet-online-reuse-ddnet"
-    "gray/adaptive" "gray/auto" "gray/default" "gray/desci" "gray/desci-fast" "gray/fast" "gray/gap-fastdvdnet" "gray/gap-fastdvdnet-online-reuse" "gray/gap-ffdnet"
+    "gray/adaptive" "gray/auto" "gray/default" "gray/desci" "gray/desci-fast" "gray/fast" "gray/fastdvdnet" "gray/gap-fastdvdnet" "gray/gap-fastdvdnet-online-reuse" "gray/gap-ffdnet"
     "gray/gap-ffdnet-fast" "gray/gap-ffdnet-online" "gray/gap-tv" "gray/gap-tv-fast" "gray/gap-wavelet" "gray/refined"
     "real/color" "real/gray"
 };

@@ -57,7 +57,8 @@ const GRAY: &[Curve] = &[
     curve("GAP-FFDNet, [skip]", "gray/gap-ffdnet-fast.toml", Budget::Stages(&[5, 10]))
         .with(&[WEIGHTS, "skip.enabled=true"]),
     curve("GAP-ShiftNet for iterates", "gray/fast.toml", Budget::Sigmas(&[3, 5, 7])),
-    curve("GAP-FastDVDnet for iterates", "gray/default.toml", Budget::Sigmas(&[4, 8, 12])),
+    curve("GAP-FastDVDnet for iterates", "gray/fastdvdnet.toml", Budget::Sigmas(&[4, 8, 12])),
+    curve("GAP-ShiftNet, then FastDVDnet", "gray/default.toml", Budget::Stages(&[1])),
     curve("GAP-FastDVDnet for iterates, then WNNM", "gray/refined.toml", Budget::Last(&[1, 2, 4, 6])),
 ];
 
@@ -69,7 +70,8 @@ const COLOR: &[Curve] = &[
     curve("two-stage FFDNet, scaled, [skip]", "color/two-stage-ffdnet-fast.toml", Budget::Stages(&[4]))
         .with(&["skip.enabled=true"]),
     curve("GAP-ShiftNet for iterates", "color/fast.toml", Budget::Sigmas(&[3, 5, 7])),
-    curve("GAP-FastDVDnet for iterates", "color/default.toml", Budget::Sigmas(&[4, 6, 8])),
+    curve("GAP-FastDVDnet for iterates", "color/fastdvdnet.toml", Budget::Sigmas(&[4, 6, 8])),
+    curve("GAP-ShiftNet, then FastDVDnet", "color/default.toml", Budget::Stages(&[1])),
     curve("GAP-FastDVDnet for iterates, then WNNM", "color/refined.toml", Budget::Last(&[1, 2, 4, 6])),
 ];
 
@@ -188,7 +190,7 @@ mod tests {
         let settings =
             |config: &str, number| GRAY.iter().find(|c| c.config == config).unwrap().settings(number).unwrap();
         assert_eq!(settings("gray/refined.toml", 4), ["stage.1.iterations=4"]);
-        assert_eq!(settings("gray/default.toml", 4), ["stage.0.sigma=[20, 16, 12, 7]"]);
+        assert_eq!(settings("gray/fastdvdnet.toml", 4), ["stage.0.sigma=[20, 16, 12, 7]"]);
         assert_eq!(settings("gray/gap-ffdnet.toml", 3).len(), 4);
     }
 

@@ -53,7 +53,7 @@ pub use conv::PackedConv;
 pub use error::KernelError;
 pub use geometry::{Conv3x3, Precision};
 pub use isa::Isa;
-pub use memory::keep_freed_memory;
+pub use memory::{keep_freed_memory, release_freed_memory};
 pub(crate) use op::layer_by_layer;
 pub use op::{Link, conv_chain, conv3x3, conv3x3_on};
 pub use peak::gemm_peak;

@@ -315,7 +315,10 @@ impl Experiment {
         };
         let first = self.stages.first().map_or(0, |stage| stage.denoiser);
         let part = &self.denoisers[first].part;
-        let alone = self.stages.iter().all(|stage| stage.denoiser == first) && part.adapts();
+        // What it is adapted to is the solve as far as the network makes it; others may take over from it.
+        let leading = self.stages.iter().take_while(|stage| stage.denoiser == first).count();
+        let returns = self.stages[leading..].iter().any(|stage| stage.denoiser == first);
+        let leads = part.adapts() && !returns && !self.denoisers[..first].iter().any(|d| d.part.adapts());
         let accelerate = self.solver.method.unrolled();
         let through = "but online.loss = \"split\" learns through";
         let rules = [
@@ -331,14 +334,20 @@ impl Experiment {
                 "solver.demosaicer",
                 format!("is another, {through} Menon's; legal: menon"),
             ),
-            (alone, "denoiser", format!("is another, {through} one ffdnet or fastdvdnet in all stages; legal: that")),
+            (
+                leads,
+                "denoiser",
+                format!(
+                    "is another, {through} the calls of one network, which come before all others; legal: ffdnet, fastdvdnet, shiftnet"
+                ),
+            ),
         ];
         if let Some((_, key, problem)) = rules.into_iter().find(|(holds, ..)| !holds) {
             return Err((key, problem));
         }
         let sigma = |stage: &Stage| std::iter::repeat_n(stage.sigma.unwrap_or(0.0), stage.iterations);
         self.recipe = accelerate.zip(start).map(|(accelerate, start)| Recipe {
-            sigmas: self.stages.iter().flat_map(sigma).collect(),
+            sigmas: self.stages[..leading].iter().flat_map(sigma).collect(),
             accelerate,
             start,
             flips: part.network().is_some_and(|network| network.flips),

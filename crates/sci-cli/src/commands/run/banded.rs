@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use ndarray::{Array3, Array4, Axis};
+use nets::kernels::release_freed_memory;
 use rayon::prelude::*;
 use sci_forward::bayer::mosaic_into;
 
@@ -97,6 +98,8 @@ impl Cut {
             if interrupted() {
                 return Ok(false);
             }
+            // What the bands before have left in pieces would add to what this one takes.
+            release_freed_memory();
             let scene = self.scene.band(k, self.bands.solved(band))?;
             let learns = learning && band == middle;
             let name = format!("measurement {k:>2}, band {} of {count}", band + 1);
