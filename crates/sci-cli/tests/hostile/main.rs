@@ -237,7 +237,7 @@ fn damaged_files_are_harmless() {
         source.and_then(|source| config::check(&source)).is_ok()
     };
     check("experiment, gray", gray.as_bytes(), experiment);
-    check("experiment, color", include_bytes!("../../../../configs/color/default.toml"), experiment);
+    check("experiment, color", include_bytes!("../../../../configs/color/fastdvdnet.toml"), experiment);
     check("experiment that extends another", b"extends = 'b.toml'\n[denoiser]\nweight = 0.2\n", experiment);
     check("training file", include_bytes!("../../../../configs/train/fastdvdnet_gray.toml"), is_training);
     check("training file, iterates", include_bytes!("../../../../configs/train/fastdvdnet_gray_sci.toml"), is_training);
