@@ -19,6 +19,9 @@ use crate::io::output::WriteError;
 pub const MARGIN: usize = 64;
 /// Bands begin at a multiple of this: networks work at an eighth of the size, and a Bayer pattern has a period of two.
 const STEP: usize = 16;
+/// The lowest band without margins. Bands that are evened out to at most this have at least the rows over which two are blended, so that no row is
+/// one of three.
+const LOWEST: usize = 96;
 /// What the program takes before it has a scene: its code, weights, threads.
 const PROGRAM: usize = 100 << 20;
 
@@ -67,7 +70,7 @@ impl Bands {
         if fits >= height {
             return Ok(Self { edges: vec![0, height] });
         }
-        let least = 2 * MARGIN + 2 * MARGIN.next_multiple_of(STEP);
+        let least = 2 * MARGIN + LOWEST;
         if fits < least {
             return Err(footprint.bytes(VideoShape { height: least, ..shape }));
         }
@@ -237,7 +240,8 @@ mod tests {
 
     #[test]
     fn bands_fit_cover_every_row_and_share_it() {
-        for memory in [1usize << 30, 2 << 30, 3 << 30] {
+        let least = Bands::new(SHAPE, FOOTPRINT, 400 << 20).unwrap_err();
+        for memory in [least, 1usize << 30, 2 << 30, 3 << 30] {
             let bands = Bands::new(SHAPE, FOOTPRINT, memory).unwrap();
             assert!(bands.count() > 1);
             for band in 0..bands.count() {
