@@ -374,7 +374,7 @@ impl Experiment {
         let demosaicer = self.solver.demosaicer.as_ref().and_then(|d| d.weights());
         let demosaicer = demosaicer.map(|_| Footprint { of_frame_pixel: 32, of_pixel: 1250, ..Footprint::default() });
         let parts = self.denoisers.iter().map(|d| d.part.footprint(is_color)).chain(demosaicer);
-        // The allocator keeps much of what learning took, so that it adds to what solving takes.
+        // Not all of what learning took can be given back, so that it adds to what solving takes.
         parts.fold(
             Footprint { of_frame_pixel: solver.of_frame_pixel, of_pixel: solver.of_pixel, ..self.learning() },
             |most, part| Footprint {
