@@ -165,6 +165,22 @@ fn training_on_iterates_learns_resumes_and_validates_by_reconstruction() {
     }
 }
 
+/// An update by both is the mean of three lessons: two calls of a solve, and a noisy batch.
+#[test]
+fn a_step_learns_from_iterates_and_noise_at_once() {
+    let noise = Some(NoiseConfig { sigma: [0.0, 50.0] });
+    let mut config = on_iterates(config(FASTDVDNET, 1, 24));
+    let alone = run(&mut trainer(&config), 1)[0].loss;
+    config.data.frames = 3;
+    config.noise = noise;
+    let mut both = trainer(&config);
+    let before = both.validate().unwrap();
+    let first = run(&mut both, 24)[0].loss;
+    assert!(first != alone && (first - alone).abs() < alone, "{first} {alone}");
+    let after = both.validate().unwrap();
+    assert!(after[0].psnr_db > before[0].psnr_db + 1.0, "{before:?} {after:?}");
+}
+
 #[test]
 fn random_weights_begin_as_the_residual_connection_with_open_relus() {
     for (network, frames, blocks) in [(FFDNET, 1, 1), (FASTDVDNET, 3, 2), (DDNET, 3, 2)] {
@@ -267,7 +283,7 @@ fn a_network_that_grows_is_at_first_what_it_was() {
 }
 
 #[test]
-fn noise_or_iterates_but_not_both() {
+fn noise_iterates_or_both() {
     let good = on_iterates(config(FFDNET, 1, 1));
     let key = |change: fn(&mut TrainConfig)| {
         let mut config = good.clone();
@@ -278,7 +294,11 @@ fn noise_or_iterates_but_not_both() {
         }
     };
     assert!(good.validate().is_ok());
-    assert_eq!(key(|c| c.noise = Some(NoiseConfig { sigma: [0.0, 50.0] })), "noise");
+    let both = TrainConfig { noise: Some(NoiseConfig { sigma: [0.0, 50.0] }), ..good.clone() };
+    assert!(both.validate().is_ok());
+    assert_eq!(key(|c| (c.iterates, c.camera) = (None, None)), "noise");
+    assert_eq!(key(|c| c.noise = Some(NoiseConfig { sigma: [50.0, 0.0] })), "noise.sigma");
+    assert_eq!(key(|c| c.data.frames = 2), "data.frames");
     assert_eq!(key(|c| c.iterates = None), "camera");
     assert_eq!(key(|c| c.camera = None), "camera");
     assert_eq!(key(|c| c.network = DDNET), "iterates");

@@ -28,7 +28,7 @@ pub struct TrainConfig {
     /// shut is at first what it was. Default none.
     #[serde(default)]
     pub renew: Vec<String>,
-    /// The noise put on its input; this or `iterates`.
+    /// The noise put on its input; this, `iterates` or both: then a step learns from a batch of noisy clips as from one more iterate.
     #[serde(default)]
     pub noise: Option<NoiseConfig>,
     /// What measures the clips of `iterates`.
@@ -411,14 +411,13 @@ impl TrainConfig {
         let legal = "with [iterates], and only then";
         check(self.iterates.is_some() == self.camera.is_some(), "camera", "left out, or not needed", legal)?;
         self.camera.iter().try_for_each(|camera| self.validate_camera(camera))?;
-        match (&self.noise, &self.iterates) {
-            (Some(NoiseConfig { sigma: [low, high] }), None) => {
-                let ordered = level(*low) && level(*high) && low <= high;
-                check(ordered, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
-            }
-            (None, Some(iterates)) => self.validate_iterates(iterates)?,
-            _ => check(false, "noise", "several", "one of the tables [noise] and [iterates]")?,
+        let lessons = self.noise.is_some() || self.iterates.is_some();
+        check(lessons, "noise", "neither [noise] nor [iterates]", "at least one of these tables")?;
+        if let Some(NoiseConfig { sigma: [low, high] }) = &self.noise {
+            let ordered = level(*low) && level(*high) && low <= high;
+            check(ordered, "noise.sigma", format_args!("[{low}, {high}]"), LEVELS)?;
         }
+        self.iterates.iter().try_for_each(|iterates| self.validate_iterates(iterates))?;
         check(training.steps >= 1, "training.steps", training.steps, "at least 1")?;
         let rate = training.learning_rate;
         check(rate > 0.0 && rate <= 1.0, "training.learning_rate", rate, "above 0 and at most 1")?;
@@ -439,7 +438,8 @@ impl TrainConfig {
     fn validate_camera(&self, camera: &CameraConfig) -> Result<()> {
         let CameraConfig { frames: [few, many], density: [thin, dense], masks, noise, .. } = camera;
         let CameraConfig { noisy, holes, saturated, mask_errors, .. } = camera;
-        check(self.data.frames == 1, "data.frames", self.data.frames, "left out: camera.frames says how many")?;
+        let frames = self.data.frames == 1 || self.noise.is_some();
+        check(frames, "data.frames", self.data.frames, "left out without [noise]: camera.frames says how many")?;
         let frames = (1..=64).contains(few) && (*few..=64).contains(many);
         check(frames, "camera.frames", format_args!("[{few}, {many}]"), "two numbers from 1 to 64, the lower first")?;
         let density = *thin > 0.0 && thin <= dense && *dense <= 1.0;

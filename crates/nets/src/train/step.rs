@@ -274,7 +274,7 @@ impl Trainer {
         self.config.camera.as_ref().expect("validated: iterates have a camera")
     }
 
-    /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves.
+    /// One update, by a new batch of noisy clips, by iterates of a solver or by whole solves; by both, if the settings have both.
     ///
     /// # Errors
     /// [`Error::Diverged`] when loss or gradient is not finite: [`Trainer::back_off`] is the way to go on then.
@@ -285,13 +285,13 @@ impl Trainer {
         // Stream 0 initialised the weights.
         let mut rng = self.rng(self.step + 1);
         let learning_rate = self.rate * self.config.learning_rate(self.step);
-        let lessons = match &self.config.iterates {
+        let mut lessons = match &self.config.iterates {
             Some(iterates) => self.iterates(iterates, &mut rng)?,
-            None => {
-                let noise = self.config.noise.clone().expect("validated: noise or iterates");
-                vec![Lesson::Batch(self.noisy(&noise, &mut rng)?)]
-            }
+            None => Vec::new(),
         };
+        if let Some(noise) = &self.config.noise {
+            lessons.push(Lesson::Batch(self.noisy(noise, &mut rng)?));
+        }
         if self.step == 0 {
             self.open_layers(&lessons[0])?;
         }
