@@ -2,6 +2,7 @@
 
 use nets::train::*;
 use nets::{Error, WeightFile};
+use std::collections::BTreeMap;
 
 fn photo(channels: usize, seed: usize) -> Frame {
     Frame::from_shape_fn((channels, 40, 36), |(c, y, x)| {
@@ -47,6 +48,7 @@ fn config(network: NetworkConfig, frames: usize, steps: u64) -> TrainConfig {
             final_learning_rate: 0.0,
             warmup: steps.min(2),
             average: 0.9,
+            blend: 1.0,
             clip_norm: 1.0,
             revive: 100,
         },
@@ -127,8 +129,13 @@ fn on_iterates(mut config: TrainConfig) -> TrainConfig {
     config.noise = None;
     config.data.frames = 1;
     config.data.batch = 1;
-    config.iterates =
-        Some(IteratesConfig { sigmas: vec![50.0, 25.0, 12.0], calls: 2, unrolled: false, start_iterations: 2 });
+    config.iterates = Some(IteratesConfig {
+        first: None,
+        sigmas: vec![50.0, 25.0, 12.0],
+        calls: 2,
+        unrolled: false,
+        start_iterations: 2,
+    });
     config.camera = Some(camera());
     config
 }
@@ -179,6 +186,43 @@ fn a_step_learns_from_iterates_and_noise_at_once() {
     assert!(first != alone && (first - alone).abs() < alone, "{first} {alone}");
     let after = both.validate().unwrap();
     assert!(after[0].psnr_db > before[0].psnr_db + 1.0, "{before:?} {after:?}");
+}
+
+#[test]
+fn a_blend_lies_between_the_start_and_what_was_learned() {
+    let mut config = config(FFDNET, 1, 4);
+    let start = trainer(&config).weights().unwrap();
+    config.weights = Some("bundled:any".into());
+    let other = start.iter().map(|(name, t)| (name.clone(), t.affine(0.5, 0.1).unwrap())).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let trained = |blend: f64| {
+        let mut config = config.clone();
+        config.training.blend = blend;
+        let mut first = trainer(&config);
+        first.start_from(&start).unwrap();
+        run(&mut first, 2);
+        first.save(&path).unwrap();
+        // What it began with is in the checkpoint.
+        let mut second = trainer(&config);
+        second.start_from(&other).unwrap();
+        second.resume(&path).unwrap();
+        run(&mut second, 2);
+        second.weights().unwrap()
+    };
+    let (whole, quarter) = (trained(1.0), trained(0.25));
+    let values = |state: &BTreeMap<String, candle_core::Tensor>| -> Vec<f32> {
+        state.values().flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap()).collect()
+    };
+    let mut moved = false;
+    for ((start, whole), quarter) in values(&start).into_iter().zip(values(&whole)).zip(values(&quarter)) {
+        assert!((0.75 * start + 0.25 * whole - quarter).abs() < 1e-6, "{start} {whole} {quarter}");
+        moved |= (whole - start).abs() > 1e-3;
+    }
+    assert!(moved);
+    config.weights = None;
+    config.training.blend = 0.5;
+    assert!(matches!(config.validate(), Err(Error::Setting { key: "training.blend", .. })));
 }
 
 #[test]

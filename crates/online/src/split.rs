@@ -51,6 +51,8 @@ pub struct SplitConfig {
     pub learning_rate: f64,
     /// Decay of the moving average of the weights in an update, in [0, 1).
     pub average: f64,
+    /// How far the network goes from the weights it had to that average, in (0, 1].
+    pub blend: f64,
     /// Share of the pixels that judge, in (0, 0.5].
     pub judging: f64,
     /// Crops in which they do.
@@ -87,8 +89,9 @@ impl Default for SplitConfig {
             side: 64,
             hidden: 0.12,
             calls: 7,
-            learning_rate: 3e-4,
+            learning_rate: 5e-4,
             average: 0.9,
+            blend: 0.6,
             judging: 0.05,
             judged_crops: 8,
             every: 15,
@@ -119,6 +122,7 @@ impl SplitConfig {
         let rate = self.learning_rate > 0.0 && self.learning_rate <= 1.0;
         check(rate, "learning_rate", self.learning_rate, "greater than 0 and at most 1")?;
         check((0.0..1.0).contains(&self.average), "average", self.average, "at least 0 and less than 1")?;
+        check(self.blend > 0.0 && self.blend <= 1.0, "blend", self.blend, "greater than 0 and at most 1")?;
         let judging = self.judging > 0.0 && self.judging <= 0.5;
         check(judging, "judging", self.judging, "greater than 0 and at most 0.5")?;
         check((1..=64).contains(&self.judged_crops), "judged_crops", whole(self.judged_crops), "1 to 64")?;
@@ -191,7 +195,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
         judgements.push(Judgement { updates: update, hidden: Some(mean.0 / mean.1), judged: error });
         since += 1;
         if error < best.0 {
-            (best, since) = ((error, update, learner.average()?), 0);
+            (best, since) = ((error, update, learner.blended()?), 0);
         }
         if stop || since >= config.patience {
             break;
@@ -295,6 +299,8 @@ impl Crop {
 struct Learner<'c, N> {
     net: N,
     vars: Vec<(String, Var)>,
+    /// Values of `vars` before.
+    start: Vec<Vec<f32>>,
     adam: Adam,
     average: Vec<Vec<f32>>,
     config: &'c SplitConfig,
@@ -305,8 +311,8 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
         net.set_precision(config.precision);
         let vars = net.make_some_trainable(config.parameters)?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
-        let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
-        Ok(Self { net, vars, adam, average, config })
+        let start = vars.iter().map(|(_, var)| values(var)).collect::<Result<Vec<_>>>()?;
+        Ok(Self { net, vars, adam, average: start.clone(), start, config })
     }
 
     /// One update; its loss, or nothing when a number was not finite.
@@ -343,23 +349,24 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
         Ok(Some(loss))
     }
 
-    /// The error of the average of the weights at the pixels that judge.
+    /// The error of [`Learner::blended`] at the pixels that judge.
     fn judge(&self, crops: &[Crop], recipe: &Recipe) -> Result<f64> {
-        let average = self.constant(&self.average()?)?;
+        let blended = self.constant(&self.blended()?)?;
         // A network of its own for each thread, which packs its filters once.
         let error = |net: &mut N, crop: &Crop| -> Result<f64> {
             let v = recipe.solve(&crop.given, net)?;
             Ok(f64::from(crop.loss(v.view())?.0))
         };
-        let errors = crops.par_iter().map_init(|| average.clone(), error).collect::<Result<Vec<_>>>()?;
+        let errors = crops.par_iter().map_init(|| blended.clone(), error).collect::<Result<Vec<_>>>()?;
         Ok(errors.iter().sum::<f64>() / errors.len() as f64)
     }
 
-    /// The average of the weights as a state of the network.
-    fn average(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut state = self.net.state();
-        for ((name, var), average) in self.vars.iter().zip(&self.average) {
-            state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
+    /// The weights between those before and the average of those learned, as a state of the network.
+    fn blended(&self) -> Result<BTreeMap<String, Tensor>> {
+        let (mut state, share) = (self.net.state(), self.config.blend as f32);
+        for ((name, var), (start, average)) in self.vars.iter().zip(self.start.iter().zip(&self.average)) {
+            let blended = start.iter().zip(average).map(|(s, a)| s + share * (a - s)).collect();
+            state.insert(name.clone(), Tensor::from_vec::<_, f32>(blended, var.shape(), &Device::Cpu)?);
         }
         Ok(state)
     }

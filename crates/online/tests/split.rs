@@ -21,6 +21,7 @@ const CONFIG: SplitConfig = SplitConfig {
     calls: 2,
     learning_rate: 1e-3,
     average: 0.5,
+    blend: 1.0,
     judging: 0.1,
     judged_crops: 4,
     every: 4,
@@ -70,6 +71,24 @@ fn what_is_learned_predicts_pixels_that_were_not_learned_from() {
         (found.index_axis_move(ndarray::Axis(1), 0) - moving_square(SHAPE)).mapv(|e| e * e).mean().unwrap()
     };
     assert!(error(&mut learned) < error(&mut net(1)));
+}
+
+#[test]
+fn a_blend_lies_between_the_weights_before_and_those_learned() {
+    let (square, before) = (measurement(None), net(1));
+    let learned = |blend: f64| {
+        let mut net = before.clone();
+        let record = adapt(&mut net, &square, &SplitConfig { blend, every: 12, ..CONFIG });
+        assert_eq!(record.kept, 12, "{record:?}");
+        net
+    };
+    let (whole, most) = (learned(1.0), learned(0.75));
+    let values = |net: &Ffdnet| {
+        net.state().into_values().flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap()).collect::<Vec<_>>()
+    };
+    for ((before, whole), most) in values(&before).into_iter().zip(values(&whole)).zip(values(&most)) {
+        assert!((before + 0.75 * (whole - before) - most).abs() < 1e-6, "{before} {whole} {most}");
+    }
 }
 
 #[test]

@@ -40,7 +40,11 @@ impl Training {
             let legal = "any name but that of the checkpoints, which lie beside the weights";
             return Err(source.error_at("name", format!("`name` = {:?} is not legal; legal: {legal}", config.name)));
         }
-        Ok(Self { config, source })
+        let mut training = Self { config, source };
+        if let Some(first) = training.config.iterates.as_mut().and_then(|iterates| iterates.first.as_mut()) {
+            first.weights = find_weights(&training.source, "iterates.first.weights", &first.weights)?;
+        }
+        Ok(training)
     }
 
     /// The file or folder that a key names, looked up as in experiments.

@@ -202,6 +202,14 @@ pub struct TrainingConfig {
     /// Decay per step of the moving average of the weights that is validated and exported, 0 to below 1. Default 0.999.
     #[serde(default = "average")]
     pub average: f64,
+    /// How far the exported weights go from those it began with to the moving average, above 0 and at most 1, less only with
+    /// [`TrainConfig::weights`]. Half way what is new (noise, other masks) is learned for the most part, and what was known is
+    /// hardly lost. Default 1.
+    ///
+    /// # References
+    /// Wortsman et al., *Robust fine-tuning of zero-shot models*, CVPR 2022.
+    #[serde(default = "unit")]
+    pub blend: f64,
     /// Longest gradient (Euclidean norm over all weights); longer ones are shortened to it. Above 0; default 1.
     #[serde(default = "unit")]
     pub clip_norm: f64,
@@ -216,6 +224,9 @@ pub struct TrainingConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IteratesConfig {
+    /// Another network that makes the calls before these, as it is; none without.
+    #[serde(default)]
+    pub first: Option<FirstCalls>,
     /// σ of each iteration in 0..255 units, at least one.
     pub sigmas: Vec<f32>,
     /// Iterations of the start by TV (weight 0.1); 0 starts from the normalised measurement. Default 0.
@@ -229,6 +240,16 @@ pub struct IteratesConfig {
     /// next. Default false: calls drawn at random, each by itself.
     #[serde(default)]
     pub unrolled: bool,
+}
+
+/// The calls of a solve that another network makes, before those of the network that is trained.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FirstCalls {
+    /// Its weights, a file or `bundled:NAME`.
+    pub weights: PathBuf,
+    /// σ of each of its calls in 0..255 units, at least one.
+    pub sigmas: Vec<f32>,
 }
 
 /// The simulated camera that measures each clip, drawn anew for each.
@@ -425,6 +446,9 @@ impl TrainConfig {
         check((0.0..=rate).contains(&last), "training.final_learning_rate", last, "0 to training.learning_rate")?;
         check(training.warmup <= training.steps, "training.warmup", training.warmup, "at most training.steps")?;
         check((0.0..1.0).contains(&training.average), "training.average", training.average, "0 to below 1")?;
+        let legal = "above 0 and at most 1; 1 without weights and with renew";
+        let blend = training.blend == 1.0 || self.weights.is_some() && self.renew.is_empty();
+        check(blend && training.blend > 0.0 && training.blend <= 1.0, "training.blend", training.blend, legal)?;
         let clip = training.clip_norm;
         check(clip.is_finite() && clip > 0.0, "training.clip_norm", clip, "above 0 and finite")?;
         check(self.validation.every >= 1, "validation.every", self.validation.every, "at least 1")?;
@@ -454,14 +478,16 @@ impl TrainConfig {
     }
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
-        let IteratesConfig { sigmas, start_iterations, calls, unrolled: _ } = iterates;
+        let IteratesConfig { first, sigmas, start_iterations, calls, unrolled: _ } = iterates;
         check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
-        check(
-            !sigmas.is_empty() && sigmas.iter().all(|&s| level(s)),
-            "iterates.sigmas",
-            format_args!("{sigmas:?}"),
-            "each 0 to 255",
-        )?;
+        let levels = |key, sigmas: &[f32]| {
+            let holds = !sigmas.is_empty() && sigmas.iter().all(|&s| level(s));
+            check(holds, key, format_args!("{sigmas:?}"), "at least one, each 0 to 255")
+        };
+        levels("iterates.sigmas", sigmas)?;
+        if let Some(first) = first {
+            levels("iterates.first.sigmas", &first.sigmas)?;
+        }
         check(*start_iterations <= 1000, "iterates.start_iterations", start_iterations, "0 to 1000")?;
         let legal = "1 to the number of iterates.sigmas";
         check((1..=sigmas.len()).contains(calls), "iterates.calls", calls, legal)

@@ -17,8 +17,8 @@ mod step;
 pub use crate::kernels::Precision;
 pub use adam::Adam;
 pub use config::{
-    CameraConfig, CheckpointConfig, DataConfig, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig, Optimizer,
-    TrainConfig, TrainingConfig, ValidationConfig,
+    CameraConfig, CheckpointConfig, DataConfig, FirstCalls, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig,
+    Optimizer, TrainConfig, TrainingConfig, ValidationConfig,
 };
 pub use data::{Frame, TrainData, frame_from_rgb};
 pub use step::{Resumed, Score, StepReport, Trainer};

@@ -12,9 +12,9 @@ use crate::layers::Conv;
 use crate::unrolled::{Gradients, RecordedCall, tensor};
 use crate::weights::{Storage, write_safetensors};
 use crate::{Error, Network, Result};
-use admm::{Call, Denoiser};
+use admm::Call;
 use candle_core::{Device, Tensor, Var};
-use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, concatenate, s};
+use ndarray::{Array4, ArrayView4, Axis, concatenate, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -56,9 +56,6 @@ pub struct Resumed {
     pub refused: Option<Error>,
 }
 
-/// A network as the denoiser of a solve.
-struct Solving<'n>(&'n mut dyn Network);
-
 /// Clean clips, what the network sees of them (both `[clips · T, C, P, P]`), σ of each.
 struct Batch {
     clean: Tensor,
@@ -98,9 +95,13 @@ pub struct Trainer {
     config: TrainConfig,
     data: TrainData,
     model: Box<dyn Network>,
+    /// Makes the first calls of the solves of [`IteratesConfig`].
+    first: Option<Box<dyn Network>>,
     vars: Vec<(String, Var)>,
     adam: Adam,
     average: Vec<Vec<f32>>,
+    /// What it began with.
+    start: Vec<Vec<f32>>,
     idle: Idle,
     /// Whether it began with random weights.
     random: bool,
@@ -127,21 +128,6 @@ const VALIDATION_SIDE: usize = 256;
 /// Noise on measurements that are solved to validate, in 0..255 units.
 const NOISE_LEVELS: [Option<f32>; 2] = [None, Some(25.0)];
 
-impl Denoiser for Solving<'_> {
-    fn name(&self) -> &str {
-        "network"
-    }
-
-    fn denoise(
-        &mut self,
-        call: &Call<'_>,
-        noisy: ArrayView4<'_, f32>,
-        out: ArrayViewMut4<'_, f32>,
-    ) -> std::result::Result<(), admm::BoxError> {
-        self.0.infer(call, noisy, out)
-    }
-}
-
 impl Trainer {
     /// A run at its beginning.
     ///
@@ -152,13 +138,17 @@ impl Trainer {
         data.check(config.network.channels(), config.data.photo_share)?;
         let (architecture, ends) = config.network.architecture();
         let mut model = architecture.random(ends, config.seed)?;
+        let first = match &config.iterates {
+            Some(iterates) => iterates.load_first(config.network.channels())?,
+            None => None,
+        };
         model.set_precision(config.training.precision);
         let vars = model.make_trainable()?;
         let adam = Adam::new(vars.iter().map(|(_, var)| var.clone()).collect());
         let adam = if config.training.optimizer == Optimizer::Muon { adam.with_muon() } else { adam };
-        let average = vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
-        let idle = Idle::new(&model.convs(), &vars);
-        Ok(Self { config, data, model, vars, adam, average, idle, random: true, rate: 1.0, step: 0 })
+        let start = vars.iter().map(|(_, var)| values(var)).collect::<Result<Vec<_>>>()?;
+        let (average, idle) = (start.clone(), Idle::new(&model.convs(), &vars));
+        Ok(Self { config, data, model, first, vars, adam, average, start, idle, random: true, rate: 1.0, step: 0 })
     }
 
     /// Begins with these weights, or those of a smaller network of the kind, instead of random ones, but for the layers of
@@ -178,7 +168,8 @@ impl Trainer {
         self.model.set_state(&weights.into_iter().chain(renewed).collect())?;
         self.vars = self.model.make_trainable()?;
         self.adam.rebind(self.vars.iter().map(|(_, var)| var.clone()).collect());
-        self.average = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        self.start = self.vars.iter().map(|(_, var)| values(var)).collect::<Result<_>>()?;
+        self.average = self.start.clone();
         self.random = false;
         Ok(())
     }
@@ -256,7 +247,9 @@ impl Trainer {
             let clip = self.data.clip(&mut rng, frames, data.patch, data.photo_share);
             let pattern = CfaPattern::ALL[rng.random_range(0..4)];
             let measurement = camera::measure(clip.view(), pattern, self.camera(), &mut rng)?;
-            let calls = settings.record(&measurement, &mut Solving(&mut *model.boxed()), &mut rng)?;
+            let mut model = model.boxed();
+            let mut denoiser = settings.relay(self.first.as_deref(), &mut *model);
+            let calls = settings.record(&measurement, &mut denoiser, &mut rng)?;
             if settings.unrolled {
                 return Ok(vec![Lesson::Unrolled { measurement: Box::new(measurement), clean: clip, calls }]);
             }
@@ -413,14 +406,15 @@ impl Trainer {
         Ok(())
     }
 
-    /// The averaged weights under their published names: what a run is for.
+    /// What a run is for: the averaged weights, or with [`TrainingConfig::blend`] those on the way to them, under their published names.
     ///
     /// # Errors
     /// When a tensor operation fails.
     pub fn weights(&self) -> Result<BTreeMap<String, Tensor>> {
-        let mut state = self.model.state();
-        for ((name, var), average) in self.vars.iter().zip(&self.average) {
-            state.insert(name.clone(), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
+        let (mut state, share) = (self.model.state(), self.config.training.blend as f32);
+        for ((name, var), (start, average)) in self.vars.iter().zip(self.start.iter().zip(&self.average)) {
+            let blended = start.iter().zip(average).map(|(s, a)| (1.0 - share) * s + share * a).collect();
+            state.insert(name.clone(), Tensor::from_vec::<_, f32>(blended, var.shape(), &Device::Cpu)?);
         }
         Ok(state)
     }
@@ -482,7 +476,8 @@ impl Trainer {
             let clean = centre(&to_video(clip, VALIDATION_FRAMES));
             let pattern = CfaPattern::ALL[i % 4];
             let measurement = camera::plain(clean.view(), pattern, sigma.unwrap_or(0.0) / 255.0, &mut rng)?;
-            let restored = settings.recipe().solve(&measurement, &mut Solving(model))?;
+            let mut denoiser = settings.relay(self.first.as_deref(), model);
+            let restored = settings.recipe().solve(&measurement, &mut denoiser)?;
             for (clean, restored) in clean.outer_iter().zip(restored.outer_iter()) {
                 sum += frame_psnr(clean, restored);
                 count += 1;
@@ -516,6 +511,11 @@ impl Trainer {
             tensors.insert(format!("average/{name}"), Tensor::from_slice(average, var.shape(), &Device::Cpu)?);
             tensors.insert(format!("first/{name}"), m);
             tensors.insert(format!("second/{name}"), v);
+        }
+        if self.config.training.blend < 1.0 {
+            for ((name, var), start) in self.vars.iter().zip(&self.start) {
+                tensors.insert(format!("start/{name}"), Tensor::from_slice(start, var.shape(), &Device::Cpu)?);
+            }
         }
         for (weight, counts) in self.idle.counts() {
             tensors.insert(format!("idle/{}", self.vars[weight].0), Tensor::new(counts, &Device::Cpu)?);
@@ -573,9 +573,10 @@ impl Trainer {
             let tensor = tensor.ok_or_else(|| Error::format(path, format!("{key} is missing or of another shape")))?;
             Ok(tensor.flatten_all()?.to_vec1()?)
         };
-        let (mut weights, mut averages, mut moments) = (Vec::new(), Vec::new(), Vec::new());
-        for (name, var) in &self.vars {
+        let (mut weights, mut averages, mut moments, mut starts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for ((name, var), start) in self.vars.iter().zip(&self.start) {
             let shape = var.dims();
+            starts.push(if self.config.training.blend < 1.0 { take("start", name, shape)? } else { start.clone() });
             weights.push(take("weights", name, shape)?);
             averages.push(take("average", name, shape)?);
             moments.push((take("first", name, shape)?, take("second", name, shape)?));
@@ -591,7 +592,7 @@ impl Trainer {
         for ((_, var), weights) in self.vars.iter().zip(weights) {
             var.set(&Tensor::from_vec(weights, var.shape(), var.device())?)?;
         }
-        self.average = averages;
+        (self.average, self.start) = (averages, starts);
         self.idle.restore(idle);
         self.adam.restore(meta.adam_steps, moments);
         centres.into_iter().for_each(|(weight, centre)| self.adam.set_centre(weight, centre));

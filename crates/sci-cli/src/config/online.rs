@@ -29,8 +29,8 @@ const LOSSES: [(&str, bool); 2] = [("measurement", false), ("split", true)];
 /// What only one of the losses has.
 const OF_MEASUREMENT: [&str; 10] =
     ["preset", "first", "interval", "max_updates", "steps", "stride", "input_noise", "growth", "held_out", "back_off"];
-const OF_SPLIT: [&str; 9] =
-    ["updates", "crops", "side", "hidden", "calls", "average", "judging", "judged_crops", "every"];
+const OF_SPLIT: [&str; 10] =
+    ["updates", "crops", "side", "hidden", "calls", "average", "blend", "judging", "judged_crops", "every"];
 const REUSE: [(&str, Reuse); 2] = [("reset", Reuse::Reset), ("carry-over", Reuse::CarryOver)];
 
 impl Online {
@@ -100,6 +100,7 @@ fn by_splitting(t: &mut Table<'_>, seed: u64) -> AdaptConfig {
         calls: t.whole("calls", default.calls, 1..=MAX_ITERATIONS),
         learning_rate: t.number("learning_rate", default.learning_rate, 1e-12..=1.0),
         average: t.number("average", default.average, 0.0..=0.9999),
+        blend: t.number("blend", default.blend, 1e-3..=1.0),
         judging: t.number("judging", default.judging, 1e-3..=0.5),
         judged_crops: t.whole("judged_crops", default.judged_crops, 1..=64),
         every: t.whole("every", default.every, 1..=MAX_ITERATIONS),
