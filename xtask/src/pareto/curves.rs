@@ -59,7 +59,7 @@ const GRAY: &[Curve] = &[
     curve("GAP-ShiftNet for iterates", "gray/fast.toml", Budget::Sigmas(&[3, 5, 7])),
     curve("GAP-FastDVDnet for iterates", "gray/fastdvdnet.toml", Budget::Sigmas(&[4, 8, 12])),
     curve("GAP-ShiftNet, then FastDVDnet", "gray/default.toml", Budget::Stages(&[1])),
-    curve("GAP-FastDVDnet for iterates, then WNNM", "gray/refined.toml", Budget::Last(&[1, 2, 4, 6])),
+    curve("ShiftNet, FastDVDnet and WNNM", "gray/refined.toml", Budget::Last(&[1, 2, 4, 6])),
 ];
 
 const COLOR: &[Curve] = &[
@@ -189,7 +189,7 @@ mod tests {
         }
         let settings =
             |config: &str, number| GRAY.iter().find(|c| c.config == config).unwrap().settings(number).unwrap();
-        assert_eq!(settings("gray/refined.toml", 4), ["stage.1.iterations=4"]);
+        assert_eq!(settings("gray/refined.toml", 4), ["stage.2.iterations=4"]);
         assert_eq!(settings("gray/fastdvdnet.toml", 4), ["stage.0.sigma=[20, 16, 12, 7]"]);
         assert_eq!(settings("gray/gap-ffdnet.toml", 3).len(), 4);
     }

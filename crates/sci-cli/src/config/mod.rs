@@ -528,9 +528,9 @@ mod tests {
                 .collect::<Vec<_>>()
         };
         let refined = stages("seed=0");
-        assert_eq!(refined.len(), 14);
-        assert_eq!(refined[..2], [(Some(20.0), 1, 0), (Some(18.0), 1, 0)]);
-        assert_eq!(refined[12..], [(Some(12.0), 6, 1), (Some(8.0), 6, 1)]);
+        assert_eq!(refined.len(), 15);
+        assert_eq!(refined[..2], [(Some(20.0), 1, 0), (Some(17.0), 1, 0)]);
+        assert_eq!(refined[12..], [(Some(7.0), 1, 1), (Some(12.0), 6, 2), (Some(8.0), 6, 2)]);
         let written_out = "stage=[{sigma=9.5,iterations=3},{sigma=4,iterations=3}]";
         assert_eq!(stages("stage=[{sigma=[9.5, 4],iterations=3}]"), stages(written_out));
     }
