@@ -54,6 +54,7 @@ fn training(c: &mut Criterion) {
             final_learning_rate: 0.0,
             warmup: 0,
             average: 0.999,
+            blend: 1.0,
             clip_norm: 1.0,
             revive: 100,
         },
