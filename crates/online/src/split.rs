@@ -18,10 +18,10 @@
 
 use crate::{Error, Result};
 use admm::Denoiser;
-use candle_core::{Device, Tensor, Var};
+use candle_core::{Tensor, Var};
 use ndarray::{Array2, Array3, Array4, ArrayView4, Zip, s};
 use nets::kernels::Precision;
-use nets::train::Adam;
+use nets::train::{Adam, blend};
 use nets::unrolled::{Gradients, Recipe};
 use nets::{Network, Parameters};
 use rand::{RngExt, SeedableRng};
@@ -90,7 +90,8 @@ impl Default for SplitConfig {
     /// | at 8e-4 | .35, –, .83, 1.14 | .35, –, .92, 1.47 | .27, –, .79, 1.72 |
     ///
     /// So half is enough where a scene is like those of the training, and leaves more of what the network knew; the default lies between.
-    /// Half of the updates at 8e-4 had less than half of the gain. Hiding a quarter or two fifths of the pixels, and learning four times from each trial solve, lost all of it or the half.
+    /// Half of the updates at 8e-4 had less than half of the gain. Hiding a quarter or two fifths of the pixels, and learning four times from
+    /// each trial solve, lost all of it or the half.
     fn default() -> Self {
         Self {
             updates: 30,
@@ -372,11 +373,8 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
 
     /// The weights between those before and the average of those learned, as a state of the network.
     fn blended(&self) -> Result<BTreeMap<String, Tensor>> {
-        let (mut state, share) = (self.net.state(), self.config.blend as f32);
-        for ((name, var), (start, average)) in self.vars.iter().zip(self.start.iter().zip(&self.average)) {
-            let blended = start.iter().zip(average).map(|(s, a)| s + share * (a - s)).collect();
-            state.insert(name.clone(), Tensor::from_vec::<_, f32>(blended, var.shape(), &Device::Cpu)?);
-        }
+        let mut state = self.net.state();
+        blend(&mut state, &self.vars, &self.start, &self.average, self.config.blend)?;
         Ok(state)
     }
 

@@ -3,6 +3,7 @@
 //! [`Trainer`] owns one run; the caller loops over [`Trainer::step`], validates and saves when it likes.
 
 mod adam;
+mod blend;
 mod camera;
 mod centre;
 mod checkpoint;
@@ -16,6 +17,7 @@ mod step;
 
 pub use crate::kernels::Precision;
 pub use adam::Adam;
+pub use blend::blend;
 pub use config::{
     CameraConfig, CheckpointConfig, DataConfig, FirstCalls, IteratesConfig, Loss, MaskKind, NetworkConfig, NoiseConfig,
     Optimizer, TrainConfig, TrainingConfig, ValidationConfig,

@@ -1,6 +1,7 @@
 //! The training loop's body.
 
 use super::adam::Adam;
+use super::blend::blend;
 use super::camera;
 use super::centre::{Centre, Variables, hold_open, open};
 use super::checkpoint::{self, Meta};
@@ -411,11 +412,8 @@ impl Trainer {
     /// # Errors
     /// When a tensor operation fails.
     pub fn weights(&self) -> Result<BTreeMap<String, Tensor>> {
-        let (mut state, share) = (self.model.state(), self.config.training.blend as f32);
-        for ((name, var), (start, average)) in self.vars.iter().zip(self.start.iter().zip(&self.average)) {
-            let blended = start.iter().zip(average).map(|(s, a)| (1.0 - share) * s + share * a).collect();
-            state.insert(name.clone(), Tensor::from_vec::<_, f32>(blended, var.shape(), &Device::Cpu)?);
-        }
+        let mut state = self.model.state();
+        blend(&mut state, &self.vars, &self.start, &self.average, self.config.training.blend)?;
         Ok(state)
     }
 
