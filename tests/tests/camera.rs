@@ -111,6 +111,22 @@ fn a_camera_with_faults_is_simulated_alike_by_both_ways() {
     assert!(clean > told && told > file + 0.3, "{clean} {told} {file}");
 }
 
+/// Defective pixels stay where they are when masks turn out to sit elsewhere, and good ones are not taken for defective for that.
+#[test]
+fn defective_pixels_are_told_from_masks_that_sit_elsewhere() {
+    let bench = bench(&["--set", "shift=[0.5,-0.3]", "--set", "dead=0.004", "--set", "hot=0.004"]);
+    let told = bench.sci(&["mask", "--out", "mask.npy", "--frames", "6", "--size", "48x48", "--seed", "3"]);
+    assert_eq!(told.code, 0, "{}", told.stderr);
+    let settings = ["data.mask=mask.npy", "data.calibration=auto", "data.sensor.clip=none"];
+    let (believed, _) = run(&bench, &settings);
+    let (left_out, record) = run(&bench, &[&settings[..], &["data.defects=exclude"]].concat());
+    assert!(left_out > believed + 3.0, "{left_out} {believed}");
+    for (axis, shift) in [0.5, -0.3].iter().enumerate() {
+        let found = record["calibration"]["shift"][axis].as_f64().unwrap();
+        assert!((found - shift).abs() < 0.06, "{}", record["calibration"]["shift"]);
+    }
+}
+
 #[test]
 fn a_camera_that_cannot_be_is_refused() {
     let bench = bench(&[]);

@@ -86,3 +86,31 @@ fn what_is_out_of_range_is_refused_and_a_stop_is_heard() {
     });
     assert!(matches!(stopped, Err(CalibrateError::Stopped)) && solves == 3);
 }
+
+/// What is clipped or dead says nothing of where the masks sit, or how much light a frame gets.
+#[test]
+fn clipped_and_dead_pixels_are_not_believed() {
+    let truth = &scenes()[1];
+    let clipped = |y: &Array2<f32>| {
+        let mut all: Vec<f32> = y.iter().copied().collect();
+        all.sort_by(f32::total_cmp);
+        let level = all[all.len() * 8 / 10];
+        (y.mapv(|y| y.min(level)), level)
+    };
+    for shift in [[0.0, 0.0], [0.5, -0.3]] {
+        let (mut y, level) = clipped(&measured(truth, &MaskMismatch { shift, ..MaskMismatch::default() }));
+        let left_out: Vec<(usize, usize)> = (0..20).map(|i| ((7 * i) % 48, (11 * i) % 48)).collect();
+        left_out.iter().for_each(|&at| y[at] = 0.0);
+        let found = find(&Calibration { clip: Some(level), left_out, ..shifts() }, y.clone());
+        for (axis, shift) in shift.iter().enumerate() {
+            assert!((found.mismatch.shift[axis] - shift).abs() < 0.06, "{shift:?}: {:?}", found.parameters);
+        }
+        assert_eq!(found.exposure, None);
+        let all = find(&shifts(), y);
+        assert!(found.error[1] < 0.5 * all.error[1], "{:?} {:?}", found.error, all.error);
+    }
+    let beyond = Calibration { left_out: vec![(3, 48)], ..shifts() };
+    let result =
+        beyond.find(&told(), None, &[measured(truth, &MaskMismatch::default())], &mut |_| ControlFlow::Continue(()));
+    assert!(matches!(result, Err(CalibrateError::LeftOut { column: 48, .. })));
+}

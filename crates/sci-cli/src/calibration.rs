@@ -6,10 +6,11 @@ use std::sync::Arc;
 
 use admm::Exposure;
 use anyhow::Context;
-use ndarray::{Array2, Axis, Zip};
+use ndarray::{Array2, Axis, Zip, s};
 use sci_forward::{MaskMismatch, MaskOperator, MaskStack};
 use serde::{Deserialize, Serialize};
 
+use crate::io::defects::{Defect, LeftOut};
 use crate::io::read_file;
 use crate::io::scene::Scene;
 
@@ -84,7 +85,9 @@ pub fn find(
     settings: &admm::Calibration,
     watch: Watch<'_>,
 ) -> anyhow::Result<Calibration> {
-    let masks = masks_of(scene)?;
+    let masks = masks_told(scene)?;
+    let left_out = scene.left_out.iter().map(|pixel| pixel.defect.at).collect();
+    let settings = admm::Calibration { clip: scene.clip, left_out, ..settings.clone() };
     let chosen: Vec<Array2<f32>> =
         measurements.iter().take(MOST_MEASUREMENTS).map(|&k| scene.y(k).to_owned()).collect();
     let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| watch(progress.solves, progress.expected));
@@ -97,9 +100,15 @@ fn median(image: &Array2<f32>) -> f32 {
     *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-fn masks_of(scene: &Scene) -> anyhow::Result<MaskStack> {
+/// The masks of a scene, those at pixels that are left out with them.
+fn masks_told(scene: &Scene) -> anyhow::Result<MaskStack> {
     let source = scene.operator.masks().context("the scene has no masks to calibrate")?;
-    Ok(MaskStack::from_source(source)?)
+    let masks = MaskStack::from_source(source)?;
+    let mut all = masks.view().to_owned();
+    for LeftOut { defect: Defect { at: (row, column), .. }, masks } in &scene.left_out {
+        all.slice_mut(s![.., *row, *column]).iter_mut().zip(masks).for_each(|(c, told)| *c = *told);
+    }
+    Ok(MaskStack::new(all)?)
 }
 
 impl Calibration {
@@ -158,14 +167,15 @@ impl Calibration {
     }
 
     /// The masks as they are; closed where that comes from beyond the edge of those told, and where they are hardly open, so that what is
-    /// measured there is left out.
+    /// measured there is left out, as are pixels that the scene leaves out.
     ///
     /// # Errors
     /// If nothing of them is left open.
     pub fn masks(&self, scene: &Scene) -> anyhow::Result<MaskStack> {
         let mismatch = self.mismatch();
-        let moved = mismatch.apply(&masks_of(scene)?)?;
-        let known = mismatch.reach(moved.shape().image_dim());
+        let moved = mismatch.apply(&masks_told(scene)?)?;
+        let mut known = mismatch.reach(moved.shape().image_dim());
+        scene.left_out.iter().for_each(|pixel| known[pixel.defect.at] = false);
         let exposed = match &self.exposure {
             Some(gains) => Exposure { gains: gains.clone(), uncertainty: 0.0 }.apply(&moved)?,
             None => moved,

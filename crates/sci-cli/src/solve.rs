@@ -43,23 +43,25 @@ pub fn choose(experiment: &Experiment, count: usize) -> Result<Vec<usize>, Strin
     }
 }
 
-/// Moves the masks to where they really are, if that is asked for; `watch` is as in [`calibration::find`].
+/// Moves the masks to where they really are, if that is asked for, and looks for defective pixels by them: how they sit, and what there is to
+/// say of pixels. `watch` is as in [`calibration::find`].
 ///
 /// # Errors
-/// A file that is no calibration, and those of [`calibration::find`].
+/// A file that is no calibration, those of [`calibration::find`], and a scene of which no pixel is left.
 pub fn calibrate(
     experiment: &Experiment,
     scene: &mut Scene,
     chosen: &[usize],
     watch: calibration::Watch<'_>,
-) -> anyhow::Result<Option<Calibration>> {
+) -> anyhow::Result<Option<(Calibration, Option<String>)>> {
     let found = match &experiment.data.calibration {
         config::Calibration::None => return Ok(None),
         config::Calibration::File(path) => Calibration::read(path).context("data.calibration")?,
         config::Calibration::Auto => calibration::find(scene, chosen, &admm::Calibration::default(), watch)?,
     };
     found.apply(scene)?;
-    Ok(Some(found))
+    let note = scene.look_for_defects(experiment.data.reading.defects)?;
+    Ok(Some((found, note)))
 }
 
 /// Solves the first of the measurements `left`; `previous` is what the sensor sees of the result before, where the factory needs it.

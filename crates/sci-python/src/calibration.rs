@@ -48,7 +48,7 @@ pub(crate) fn calibrate<'py>(
     clock: bool,
 ) -> PyResult<(Bound<'py, PyArray3<f32>>, Bound<'py, PyAny>)> {
     let (mask, meas) = (stored("masks", masks)?, Some(stored("measurement", measurement)?));
-    let reading = Reading { cfa: pattern(cfa)?, ..Reading::default() };
+    let reading = Reading { cfa: pattern(cfa)?, masks_off: 1, ..Reading::default() };
     let scene = scene::of_arrays(Arrays { mask, meas, truth: None }, &reading).map_err(|e| raised(e.into()))?;
     say(py, &scene.warnings, &py.get_type::<PyUserWarning>())?;
     let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };

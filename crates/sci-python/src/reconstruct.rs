@@ -10,7 +10,6 @@ use pyo3::exceptions::{PyRuntimeWarning, PyUserWarning};
 use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict};
-use sci_cli::calibration::Calibration;
 use sci_cli::config::{self, Experiment};
 use sci_cli::factory::Factory;
 use sci_cli::io::scene::{self, Arrays, Scene};
@@ -87,6 +86,7 @@ pub(crate) fn reconstruct<'py>(
     say(py, &scene.warnings, &py.get_type::<PyUserWarning>())?;
     let show = Shown { callback: callback(py, progress)?, raised: None };
     let solved = pool::run(py, |stop| solve(&experiment, scene, show, stop, begin))?.map_err(raised)?;
+    say(py, solved.note.as_slice(), &py.get_type::<PyUserWarning>())?;
     let diverged = solved.record.measurements.iter().filter(|m| m.stop == Ended::Diverged);
     let advice: Vec<String> = diverged.map(|m| solve::advice(m, &experiment)).collect();
     say(py, &advice, &py.get_type::<PyRuntimeWarning>())?;
@@ -96,6 +96,8 @@ pub(crate) fn reconstruct<'py>(
 struct Solved {
     frames: ArrayD<f32>,
     record: Record,
+    /// What there is to say of pixels.
+    note: Option<String>,
 }
 
 /// What `sci run` does, without a folder.
@@ -109,7 +111,7 @@ fn solve(
     let chosen = solve::choose(experiment, scene.len()).map_err(Refused)?;
     let mut look =
         |_, _| if stop.is_set() { std::ops::ControlFlow::Break(()) } else { std::ops::ControlFlow::Continue(()) };
-    let calibration: Option<Calibration> = solve::calibrate(experiment, &mut scene, &chosen, &mut look)?;
+    let (calibration, note) = solve::calibrate(experiment, &mut scene, &chosen, &mut look)?.unzip();
     let mut factory = Factory::new(experiment, scene.cfa).map_err(callers)?;
     let (mut records, mut videos) = (Vec::new(), Vec::new());
     let mut previous = None;
@@ -130,7 +132,7 @@ fn solve(
     }
     let frames = joined(videos)? * scene.unit;
     let record = solve::record(experiment, &factory, records, Vec::new(), calibration, begin)?;
-    Ok(Solved { frames, record })
+    Ok(Solved { frames, record, note: note.flatten() })
 }
 
 /// `[T, H, W]`, in color `[T, 3, H, W]`, in the memory that it has.

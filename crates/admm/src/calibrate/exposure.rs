@@ -63,17 +63,18 @@ impl Exposure {
         MaskStack::new(exposed)
     }
 
-    /// Nothing if too little is even, or the gains cannot be told from equal ones.
-    pub(super) fn find(masks: &MaskStack, measurements: &[Array2<f32>]) -> Option<Self> {
+    /// Nothing if too little is even, or the gains cannot be told from equal ones. What is not `believed` is not used, nor what is near.
+    pub(super) fn find(masks: &MaskStack, measurements: &[Array2<f32>], believed: &[Array2<bool>]) -> Option<Self> {
         let frames = masks.shape().frames;
         if frames > MOST_FRAMES {
             return None;
         }
         let all = extended(masks.view());
         let equal: Vec<f64> = (0..frames + 2).map(|t| if (1..=frames).contains(&t) { 1.0 } else { 0.0 }).collect();
+        let whole: Vec<Array2<bool>> = believed.iter().map(squares_of).collect();
         let mut found = Self { gains: equal.clone(), uncertainty: f64::INFINITY };
         for _ in 0..ROUNDS {
-            found = Regression::of(&all, measurements, &found.gains)?.solve(&equal)?;
+            found = Regression::of(&all, measurements, &whole, &found.gains)?.solve(&equal)?;
         }
         found.gains.iter_mut().for_each(|gain| *gain = gain.max(0.0));
         let sum: f64 = found.gains.iter().sum();
@@ -144,10 +145,11 @@ struct Pixel {
 struct Regression(Vec<Pixel>);
 
 impl Regression {
-    fn of(all: &Array3<f32>, measurements: &[Array2<f32>], gains: &[f64]) -> Option<Self> {
+    fn of(all: &Array3<f32>, measurements: &[Array2<f32>], whole: &[Array2<bool>], gains: &[f64]) -> Option<Self> {
         let mut open = Array2::<f32>::zeros(measurements.first()?.dim());
         all.outer_iter().zip(gains).for_each(|(mask, gain)| open.scaled_add(*gain as f32, &mask));
-        let pixels: Vec<Pixel> = measurements.iter().flat_map(|y| even_pixels(all, y, &open)).collect();
+        let even = |(y, whole)| even_pixels(all, y, whole, &open);
+        let pixels: Vec<Pixel> = measurements.iter().zip(whole).flat_map(even).collect();
         (pixels.len() >= LEAST * gains.len()).then_some(Self(pixels))
     }
 
@@ -198,8 +200,23 @@ impl Regression {
     }
 }
 
-/// The pixels of a measurement around which it is even.
-fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, open: &Array2<f32>) -> Vec<Pixel> {
+/// The pixels of which the brightness and its slope come from believed pixels only.
+fn squares_of(believed: &Array2<bool>) -> Array2<bool> {
+    let reach = RADIUS + 1;
+    let mut whole = believed.clone();
+    for axis in [Axis(0), Axis(1)] {
+        for mut lane in whole.lanes_mut(axis) {
+            let all = lane.to_vec();
+            let end = all.len();
+            let near = |at: usize| &all[at.saturating_sub(reach)..(at + reach + 1).min(end)];
+            lane.iter_mut().enumerate().for_each(|(at, whole)| *whole = near(at).iter().all(|&believed| believed));
+        }
+    }
+    whole
+}
+
+/// The pixels of a measurement around which it is even, and `whole`.
+fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, whole: &Array2<bool>, open: &Array2<f32>) -> Vec<Pixel> {
     let (height, width) = y.dim();
     let brightness = brightness(y.view(), open.view(), RADIUS);
     let middle = brightness.mean().unwrap_or(0.0);
@@ -209,7 +226,7 @@ fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, open: &Array2<f32>) -> Vec<Pi
             let u = brightness[[i, j]];
             let down = 0.5 * (brightness[[i + 1, j]] - brightness[[i - 1, j]]);
             let right = 0.5 * (brightness[[i, j + 1]] - brightness[[i, j - 1]]);
-            if u > 0.02 * middle && down.hypot(right) < EVEN * u {
+            if whole[[i, j]] && u > 0.02 * middle && down.hypot(right) < EVEN * u {
                 let root = f64::from(u).sqrt();
                 let light = all.slice(s![.., i, j]).iter().map(|&c| f64::from(c) * root).collect();
                 let tile = i * TILES / height * TILES + j * TILES / width;
@@ -263,12 +280,17 @@ mod tests {
         Array3::from_shape_fn(SHAPE.dim(), |(t, _, j)| if j < 30 + t { 0.8 } else { 0.3 })
     }
 
+    fn exposure(masks: &MaskStack, y: Array2<f32>) -> Option<Exposure> {
+        let believed = y.mapv(|_| true);
+        Exposure::find(masks, &[y], &[believed])
+    }
+
     #[test]
     fn gains_are_found_of_masks_that_stand_still() {
         let masks = MaskStack::random(SHAPE, 0.5, 3).unwrap();
         let real = Exposure { gains: vec![0.0, 1.3, 0.9, 1.0, 0.8, 1.1, 0.9, 0.0], uncertainty: 0.0 };
         let y = MaskOperator::new(real.apply(&masks).unwrap()).forward(scene().view());
-        let found = Exposure::find(&masks, &[y]).unwrap();
+        let found = exposure(&masks, y).unwrap();
         let off = found.gains.iter().zip(&real.gains).fold(0f64, |off, (a, b)| off.max((a - b).abs()));
         assert!(off < 0.02 && off < 4.0 * found.uncertainty.max(1e-3), "{found:?}");
     }
@@ -280,7 +302,7 @@ mod tests {
         assert_eq!(motion(masks.view()), Some([0, -1]));
         let real = Exposure { gains: vec![0.5, 1.1, 0.8, 0.8, 0.8, 1.0, 0.9, 0.1], uncertainty: 0.0 };
         let y = MaskOperator::new(real.apply(&masks).unwrap()).forward(scene().view());
-        let found = Exposure::find(&masks, &[y]).unwrap();
+        let found = exposure(&masks, y).unwrap();
         let off = found.gains.iter().zip(&real.gains).fold(0f64, |off, (a, b)| off.max((a - b).abs()));
         assert!(off < 0.03, "{found:?}");
     }
@@ -289,9 +311,9 @@ mod tests {
     fn equal_gains_and_scenes_that_are_nowhere_even_say_nothing() {
         let masks = MaskStack::random(SHAPE, 0.5, 3).unwrap();
         let y = |video: Array3<f32>| MaskOperator::new(masks.clone()).forward(video.view());
-        assert_eq!(Exposure::find(&masks, &[y(scene())]), None);
+        assert_eq!(exposure(&masks, y(scene())), None);
         let rough = Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| ((i / 3 + j / 4 + t) % 2) as f32 * 0.8 + 0.1);
-        assert_eq!(Exposure::find(&masks, &[y(rough)]), None);
+        assert_eq!(exposure(&masks, y(rough)), None);
     }
 
     #[test]

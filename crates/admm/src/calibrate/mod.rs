@@ -3,6 +3,7 @@
 //! Some pixels of each measurement are held out; the others are solved by a few iterations of GAP-TV with masks that are moved, turned,
 //! blended … as [`MaskMismatch`] says, and with a black level taken off. The mismatch with which the video predicts the held-out pixels best
 //! is the one that is there: `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
+//! Clipped pixels only say that there was at least so much light: they are not asked what there was.
 //!
 //! A shift is looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in
 //! turn by parabolas through three values, with steps that shrink. What the data cannot tell stays as it was told: a parameter whose
@@ -17,7 +18,7 @@ mod search;
 pub use exposure::Exposure;
 
 use crate::{Gap, Plan, SolveError, Stage, Start, Tv, run};
-use ndarray::{Array2, ArrayView2, Zip};
+use ndarray::{Array2, Zip};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sci_forward::{CfaPattern, MaskError, MaskMismatch, MaskOperator, MaskStack, Measurement, MeasurementError};
@@ -71,6 +72,10 @@ pub struct Calibration {
     pub spacing: usize,
     /// Of the draw.
     pub seed: u64,
+    /// The level at and above which pixels of y are clipped, if one is known.
+    pub clip: Option<f32>,
+    /// Pixels (row, column) that measure nothing.
+    pub left_out: Vec<(usize, usize)>,
 }
 
 impl Default for Calibration {
@@ -85,6 +90,8 @@ impl Default for Calibration {
             exposure: true,
             spacing: 10,
             seed: 0,
+            clip: None,
+            left_out: Vec::new(),
         }
     }
 }
@@ -134,6 +141,18 @@ pub enum CalibrateError {
         value: f64,
         /// What is legal.
         legal: &'static str,
+    },
+    /// A pixel that is left out is not on the sensor.
+    #[error("left_out names row {row}, column {column} of a sensor of {height} rows and {width} columns")]
+    LeftOut {
+        /// Its row.
+        row: usize,
+        /// Its column.
+        column: usize,
+        /// Rows of the sensor.
+        height: usize,
+        /// Columns of it.
+        width: usize,
     },
     /// There is nothing to calibrate with.
     #[error("there is no measurement to calibrate with")]
@@ -186,14 +205,26 @@ impl Calibration {
         if measurements.is_empty() {
             return Err(CalibrateError::Empty);
         }
+        let (height, width) = masks.shape().image_dim();
+        if let Some(&(row, column)) = self.left_out.iter().find(|&&(row, column)| row >= height || column >= width) {
+            return Err(CalibrateError::LeftOut { row, column, height, width });
+        }
         let judge = Judge::new(masks, cfa, measurements, self)?;
         let mut found = Search::new(judge, self, watch).run()?;
         if self.exposure && cfa.is_none() {
             let dark = found.black as f32;
+            let believed: Vec<Array2<bool>> = measurements.iter().map(|y| self.believed(y)).collect();
             let measurements: Vec<Array2<f32>> = measurements.iter().map(|y| y.mapv(|y| y - dark)).collect();
-            found.exposure = Exposure::find(&found.mismatch.apply(masks)?, &measurements);
+            found.exposure = Exposure::find(&found.mismatch.apply(masks)?, &measurements, &believed);
         }
         Ok(found)
+    }
+
+    /// The pixels of a measurement that say how much light there was.
+    fn believed(&self, y: &Array2<f32>) -> Array2<bool> {
+        let mut believed = y.mapv(|y| self.clip.is_none_or(|level| y < level));
+        self.left_out.iter().for_each(|&at| believed[at] = false);
+        believed
     }
 }
 
@@ -220,11 +251,14 @@ struct Judge<'a> {
     masks: &'a MaskStack,
     cfa: Option<CfaPattern>,
     measurements: &'a [Array2<f32>],
-    /// The group of a held-out pixel.
-    groups: Array2<Option<u8>>,
+    clip: Option<f32>,
+    /// Pixels that solves are given: neither held out nor left out.
+    given: Array2<bool>,
+    /// The groups of each measurement's pixels that are asked.
+    asked: Vec<Array2<Option<u8>>>,
     /// Mean of |y|.
     level: f64,
-    /// Σ y² over the held-out pixels.
+    /// Σ y² over the pixels that are asked.
     power: f64,
 }
 
@@ -245,13 +279,21 @@ impl<'a> Judge<'a> {
             let group = rng.random_range(0..GROUPS) as u8;
             (rng.random::<f64>() < share).then_some(group)
         });
-        let held_out = |y: &Array2<f32>| {
-            Zip::from(y).and(&groups).fold(0.0, |sum, &y, group| sum + group.map_or(0.0, |_| f64::from(y).powi(2)))
+        let mut given = groups.mapv(|group| group.is_none());
+        settings.left_out.iter().for_each(|&at| given[at] = false);
+        let asked_of = |y: &Array2<f32>| {
+            let believed = settings.believed(y);
+            Zip::from(&groups).and(&believed).map_collect(|&group, &believed| group.filter(|_| believed))
         };
-        let power = measurements.iter().map(held_out).sum::<f64>().max(f64::MIN_POSITIVE);
+        let asked: Vec<Array2<Option<u8>>> = measurements.iter().map(asked_of).collect();
+        let square = |y: &Array2<f32>, asked: &Array2<Option<u8>>| {
+            Zip::from(y).and(asked).fold(0.0, |sum, &y, group| sum + group.map_or(0.0, |_| f64::from(y).powi(2)))
+        };
+        let power = measurements.iter().zip(&asked).map(|(y, asked)| square(y, asked)).sum::<f64>();
         let sum: f64 = measurements.iter().flatten().map(|&y| f64::from(y.abs())).sum();
         let level = sum / measurements.iter().map(Array2::len).sum::<usize>().max(1) as f64;
-        Ok(Self { masks, cfa, measurements, groups, level, power })
+        let (clip, power) = (settings.clip, power.max(f64::MIN_POSITIVE));
+        Ok(Self { masks, cfa, measurements, clip, given, asked, level, power })
     }
 
     /// E of a mismatch, shared out among the groups.
@@ -259,12 +301,12 @@ impl<'a> Judge<'a> {
         let masks = point.mismatch.apply(self.masks)?;
         let operator = Arc::new(MaskOperator::new(masks));
         let black = (point.black * self.level) as f32;
-        let stays = self.groups.mapv(|group| group.is_none());
+        let clip = self.clip.map(|level| level - black);
         let mut errors = [0.0; GROUPS];
-        for y in self.measurements {
-            let whole = Measurement::new(operator.clone(), y.mapv(|y| y - black))?.with_cfa(self.cfa);
-            let predicted = self.predicted(&whole, stays.view())?;
-            Zip::from(&self.groups).and(whole.y()).and(&predicted).for_each(|group, &y, &hx| {
+        for (y, asked) in self.measurements.iter().zip(&self.asked) {
+            let whole = Measurement::new(operator.clone(), y.mapv(|y| y - black))?.with_cfa(self.cfa).with_clip(clip);
+            let predicted = self.predicted(&whole)?;
+            Zip::from(asked).and(whole.y()).and(&predicted).for_each(|group, &y, &hx| {
                 if let Some(group) = group {
                     errors[usize::from(*group)] += f64::from(y - hx).powi(2) / self.power;
                 }
@@ -273,9 +315,9 @@ impl<'a> Judge<'a> {
         Ok(Errors(errors))
     }
 
-    /// H x of the whole sensor, x solved without the pixels held out.
-    fn predicted(&self, whole: &Measurement, stays: ArrayView2<'_, bool>) -> Result<Array2<f32>, CalibrateError> {
-        let given = whole.restricted(stays)?;
+    /// H x of the whole sensor, x solved by the pixels given.
+    fn predicted(&self, whole: &Measurement) -> Result<Array2<f32>, CalibrateError> {
+        let given = whole.restricted(self.given.view())?;
         let prior = Tv::new(TV_WEIGHT).on_sensor(self.cfa);
         let plan = Plan::new([Stage { sigma: None, iterations: ITERATIONS }]);
         let outcome = run(&mut Gap::accelerated(prior), &given, Start::Mean, &plan, &mut ())?;

@@ -41,7 +41,8 @@ fn parse_reach(text: &str) -> Result<f64, String> {
 
 impl Args {
     pub(super) fn run(self) -> anyhow::Result<Done> {
-        let experiment = config::load(&self.config, &self.set)?;
+        let mut experiment = config::load(&self.config, &self.set)?;
+        experiment.data.reading.masks_off = 1;
         let default = || Path::new("runs").join(format!("{}-calibration", experiment.name));
         let out = self.out.clone().unwrap_or_else(default);
         check_folder(&out)?;

@@ -77,7 +77,9 @@ impl Args {
                 }
             }
         };
+        let (calibration, note) = calibration.unzip();
         calibration.iter().flat_map(Calibration::lines).for_each(|line| outln!("{line}"));
+        note.flatten().iter().for_each(|note| say(&experiment, note));
         let mut factory = Factory::new(&experiment, subject.cfa())?;
         let layout = layout_of(&experiment, &subject, &factory);
         let all = [chosen.len() * layout.shape[0], layout.shape[1], layout.shape[2], layout.shape[3]];
@@ -242,10 +244,15 @@ fn layout_of(experiment: &Experiment, subject: &Subject, factory: &Factory<'_>) 
     Layout { shape: subject.result_shape(), unit: subject.unit(), output: experiment.output, weights }
 }
 
+/// Says what looks odd about the data of an experiment.
+fn say(experiment: &Experiment, note: &str) {
+    eprintln!("warning: {}: {note}", experiment.data.path.display());
+}
+
 /// The scene of an experiment, whose oddities are told, and the measurements of it that are wanted.
 pub(super) fn scene_and_choice(experiment: &Experiment) -> anyhow::Result<(Scene, Vec<usize>)> {
     let scene = read_scene(experiment).context("data.path")?;
-    scene.warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
+    scene.warnings.iter().for_each(|note| say(experiment, note));
     let chosen = solve::choose(experiment, scene.len()).map_err(UsageError)?;
     Ok((scene, chosen))
 }

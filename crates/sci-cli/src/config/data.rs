@@ -81,6 +81,7 @@ impl Data {
         let simulated = t.kind(&["scene", "simulate"], Some("scene"))? == "simulate";
         let keys = t.part("keys", |t| Ok(part_names(t)))?;
         let simulate = if simulated { Some(Simulate::read(t, seed)?) } else { None };
+        let calibration = calibration(t);
         let mask = if !simulated && t.holds("mask") { Some(t.path("mask")) } else { None };
         Ok(Self {
             path: t.path("path"),
@@ -91,6 +92,7 @@ impl Data {
                 scale: t.optional_number("scale", 1e-6..=1e6).map(|s| s as f32),
                 cfa: t.optional_choice("cfa", &PATTERNS),
                 defects: t.choice("defects", &DEFECTS, Defects::default()),
+                masks_off: usize::from(calibration != Calibration::None),
                 mask,
                 shift: mask_shift(t, simulated),
                 raw: if t.holds("raw") { Some(t.part("raw", |t| Ok(raw(t)))?) } else { None },
@@ -98,7 +100,7 @@ impl Data {
                 ..Reading::default()
             },
             simulate,
-            calibration: calibration(t),
+            calibration,
         })
     }
 

@@ -7,7 +7,7 @@ use sci_forward::{CfaPattern, VideoShape};
 
 use super::super::UsageError;
 use super::banded::Cut;
-use super::read_scene;
+use super::{read_scene, say};
 use crate::bands::Bands;
 use crate::config::Experiment;
 use crate::io::scene::{Banded, Scene, SceneError};
@@ -36,7 +36,7 @@ impl Subject {
             Self::Whole(scene) => (&scene.warnings, scene.len()),
             Self::Cut(cut) => (&cut.scene.warnings, cut.scene.len()),
         };
-        warnings.iter().for_each(|w| eprintln!("warning: {}: {w}", experiment.data.path.display()));
+        warnings.iter().for_each(|note| say(experiment, note));
         let chosen = solve::choose(experiment, count).map_err(UsageError)?;
         Ok((subject, chosen))
     }

@@ -7,10 +7,11 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView3, ArrayView4, Axis, s};
 use sci_forward::bayer::mosaic_into;
 use sci_forward::{
-    BinaryMasks, CfaPattern, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator, brightness,
+    BinaryMasks, CfaPattern, MaskError, MaskOperator, MaskStack, Measurement, MeasurementError, Noise, SensingOperator,
+    brightness,
 };
 
 mod banded;
@@ -32,7 +33,7 @@ pub use read::{Arrays, Decided, Video, as_read, of_arrays, read, read_gray_video
 pub use sensor::{Clip, Sensor, SensorNoise};
 pub use shift::MaskShift;
 
-use super::defects::Defects;
+use super::defects::{self, Defects, LeftOut};
 use super::raw::Raw;
 
 /// The names under which a file holds the parts of a scene.
@@ -82,6 +83,8 @@ pub struct Reading {
     pub cfa: Option<CfaPattern>,
     /// What to do about defective pixels of the sensor.
     pub defects: Defects,
+    /// How many pixels the masks may sit from where they are told to: 1 for those that are to be calibrated.
+    pub masks_off: usize,
     /// The masks' own file or folder, of any format, if they are not in the scene's.
     pub mask: Option<PathBuf>,
     /// How one mask makes those of all frames.
@@ -114,6 +117,8 @@ pub struct Scene {
     pub noise: Option<Noise>,
     /// What no measurement exceeds, in their unit.
     pub clip: Option<f32>,
+    /// Pixels that measure nothing: closed in all masks, 0 in all measurements.
+    pub left_out: Vec<LeftOut>,
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
     decided: Decided,
@@ -206,9 +211,19 @@ impl Scene {
                 });
             }
         };
-        let (noise, clip) = (None, None);
-        let decided = Decided::default();
-        let mut scene = Self { operator, measurements, truth, rgb, cfa, unit: 1.0, noise, clip, warnings, decided };
+        let mut scene = Self {
+            operator,
+            measurements,
+            truth,
+            rgb,
+            cfa,
+            unit: 1.0,
+            noise: None,
+            clip: None,
+            left_out: Vec::new(),
+            warnings,
+            decided: Decided::default(),
+        };
         scene.look_for_wrong_scales(brightest);
         Ok(scene)
     }
@@ -260,6 +275,23 @@ impl Scene {
         let b = self.frames();
         let rgb = self.rgb.as_ref()?;
         (rgb.len_of(Axis(0)) >= (k + 1) * b).then(|| rgb.slice(s![k * b..(k + 1) * b, .., .., ..]))
+    }
+
+    /// Looks for defective pixels again, by the masks as they are now, and says which there are in all; leaves them out if that is wished.
+    ///
+    /// # Errors
+    /// If no pixel is left.
+    pub fn look_for_defects(&mut self, wish: Defects) -> Result<Option<String>, MaskError> {
+        let Some(masks) = self.operator.masks() else { return Ok(None) };
+        let mut mask = MaskStack::from_source(masks)?.view().to_owned();
+        let lattice = if self.cfa.is_some() { 2 } else { 1 };
+        let mut found = defects::find(light_through(mask.view()).view(), self.measurements.view(), lattice, 0);
+        if wish == Defects::Exclude && !found.is_empty() {
+            self.left_out.extend(defects::exclude(&found, &mut mask, &mut self.measurements));
+            self.operator = operator_of(MaskStack::new(mask)?);
+            found = self.left_out.iter().map(|pixel| pixel.defect).collect();
+        }
+        Ok(defects::note(&found, wish))
     }
 
     /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers; `brightest` is what white measures at
@@ -361,6 +393,14 @@ fn brightest_light(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>) -> Opt
         false => &y / &open,
     };
     brightest_hundredth(meas.outer_iter().flat_map(light)).filter(|&bright| bright > 0.0)
+}
+
+/// What white measures `[H, W]`; of masks of both signs nothing, as their measurements do not tell how much light there was.
+fn light_through(masks: ArrayView3<'_, f32>) -> Array2<f32> {
+    match is_signed(masks) {
+        true => Array2::zeros((masks.len_of(Axis(1)), masks.len_of(Axis(2)))),
+        false => masks.sum_axis(Axis(0)),
+    }
 }
 
 /// Pixels to each side over which a scene is taken to be even, where a pixel alone says nothing.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
+use ndarray::{Array3, Array4, ArrayView3, Axis};
 use sci_forward::bayer::mosaic_into;
 use sci_forward::{MaskStack, Noise};
 
@@ -12,8 +12,9 @@ use super::scale::{self, Content};
 use super::source::Source;
 use super::{
     Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, SensorNoise, Truth, brightest_hundredth,
-    brightest_light, check_size, is_signed, names, operator_of,
+    brightest_light, check_size, is_signed, light_through, names, operator_of,
 };
+use crate::io::defects::LeftOut;
 use crate::io::samples::Array;
 use crate::io::{NamedArrays, defects};
 
@@ -138,7 +139,7 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
     } else if mask.len_of(Axis(0)) == 1 {
         notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
     }
-    let mut black = 0.0;
+    let (mut black, mut left_out) = (0.0, Vec::new());
     if let (Some(meas), Some(array)) = (meas.as_mut(), &stored) {
         if reading.decided.is_none() {
             let (level, note) = reading.sensor.clip.level(meas.view(), light_through(mask.view()).view());
@@ -158,13 +159,14 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
                 }
                 _ => *meas /= decided.unit,
             }
-            look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
+            left_out = look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
         }
     }
     let noise = noise_of(&reading.sensor, mask.view(), meas.as_ref(), &mut notes);
     let mut scene = Scene::new(&source.file, &parts.keys, mask, meas, truth, reading.cfa)?;
     let clip = decided.clip.map(|level| (level - black) / (decided.meas * decided.unit));
     (scene.unit, scene.clip, scene.noise, scene.decided) = (decided.unit, clip, noise, decided);
+    scene.left_out = left_out;
     notes.append(&mut scene.warnings);
     scene.warnings = notes;
     Ok(scene)
@@ -182,7 +184,8 @@ pub fn as_read(scene: &mut Scene, masks: MaskStack, reading: &Reading) -> Result
     scene.noise = noise_of(&reading.sensor, masks.view(), Some(&scene.measurements), &mut scene.warnings);
     scene.clip = level.map(|level| level - black);
     let mut mask = masks.view().to_owned();
-    look_for_defects(&mut mask, &mut scene.measurements, reading, scene.cfa.is_some(), &mut scene.warnings);
+    scene.left_out =
+        look_for_defects(&mut mask, &mut scene.measurements, reading, scene.cfa.is_some(), &mut scene.warnings);
     if reading.defects == Defects::Exclude {
         let key = reading.keys.mask.clone();
         let masks =
@@ -398,14 +401,6 @@ fn moved_masks(
     Ok(moved.masks)
 }
 
-/// What white measures `[H, W]`; of masks of both signs nothing, as their measurements do not tell how much light there was.
-fn light_through(masks: ArrayView3<'_, f32>) -> Array2<f32> {
-    match is_signed(masks) {
-        true => Array2::zeros((masks.len_of(Axis(1)), masks.len_of(Axis(2)))),
-        false => masks.sum_axis(Axis(0)),
-    }
-}
-
 /// The noise that solvers are told of: shot noise is that of the light, which measurements of masks of both signs do not tell.
 fn noise_of(
     sensor: &Sensor,
@@ -461,23 +456,23 @@ fn take_off_black(
     Ok(brightest_hundredth(dark.iter().copied()).unwrap_or(0.0))
 }
 
-/// Names pixels that look defective, and leaves them out if that is asked for.
+/// Names pixels that look defective, and leaves them out if that is asked for. Of masks that may sit elsewhere it is too early to say which
+/// are: [`Scene::look_for_defects`] names them.
 fn look_for_defects(
     mask: &mut Array3<f32>,
     meas: &mut Array3<f32>,
     reading: &Reading,
     is_color: bool,
     notes: &mut Vec<String>,
-) {
-    let found = defects::find(light_through(mask.view()).view(), meas.view(), if is_color { 2 } else { 1 });
-    if let Some(named) = defects::named(&found) {
-        notes.push(match reading.defects {
-            Defects::Exclude => format!("pixels left out as not measured: {named}"),
-            Defects::Keep => format!("pixels look defective: {named}; data.defects = \"exclude\" leaves them out"),
-        });
+) -> Vec<LeftOut> {
+    let lattice = if is_color { 2 } else { 1 };
+    let found = defects::find(light_through(mask.view()).view(), meas.view(), lattice, reading.masks_off);
+    if reading.masks_off == 0 {
+        notes.extend(defects::note(&found, reading.defects));
     }
-    if reading.defects == Defects::Exclude {
-        defects::exclude(&found, mask, meas);
+    match reading.defects {
+        Defects::Exclude => defects::exclude(&found, mask, meas),
+        Defects::Keep => Vec::new(),
     }
 }
 
