@@ -148,6 +148,25 @@ fn another_denoiser_may_take_over_from_the_one_that_learns() {
     assert_ne!(psnr(&followed), psnr(&alone));
 }
 
+/// Of a network it is known whether it is to take over; one that spoils what was learned is left out, of all measurements.
+#[test]
+fn a_network_that_predicts_pixels_worse_does_not_take_over() {
+    let bench = bench();
+    let alone = run(&bench, "alone", &[SPLIT, "stage=[{sigma=9,iterations=2}]"]);
+    let next = |weights: &str| {
+        format!(
+            "stage=[{{sigma=9,iterations=2}},{{denoiser={{kind=\"ffdnet\",weights=\"{weights}\"}},sigma=255,iterations=1}}]"
+        )
+    };
+    let spoilt = run(&bench, "spoilt", &[SPLIT, &next("bundled:ffdnet_gray")]);
+    let split = &spoilt["measurements"][0]["online"]["split"];
+    let judged = split["judgements"][2]["judged"].as_f64().unwrap();
+    assert!(split["taken_over"].as_f64().unwrap() > judged, "{split}");
+    assert_eq!(psnr(&spoilt), psnr(&alone));
+    let iterations = |k: usize| spoilt["measurements"][k]["iterations"].as_u64();
+    assert!((0..3).all(|k| iterations(k) == Some(2)));
+}
+
 #[test]
 fn splitting_wants_one_solve_to_learn_through() {
     let bench = bench();

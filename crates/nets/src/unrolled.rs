@@ -32,6 +32,46 @@ pub struct Recipe {
     pub dim: f32,
 }
 
+/// Who makes the first calls of a solve, where another network takes over from it.
+#[derive(Clone, Copy)]
+pub struct First<'n> {
+    /// The network.
+    pub network: &'n dyn Network,
+    /// How many calls.
+    pub calls: usize,
+}
+
+/// A network that takes a solve over from another.
+pub struct Relay<'d> {
+    first: Option<(Box<dyn Network>, usize)>,
+    then: &'d mut dyn Network,
+}
+
+impl<'d> Relay<'d> {
+    /// `then` after the first calls, or in all.
+    pub fn new(first: Option<First<'_>>, then: &'d mut dyn Network) -> Self {
+        Self { first: first.map(|first| (first.network.boxed(), first.calls)), then }
+    }
+}
+
+impl Denoiser for Relay<'_> {
+    fn name(&self) -> &str {
+        "relay"
+    }
+
+    fn denoise(
+        &mut self,
+        call: &Call<'_>,
+        noisy: ArrayView4<'_, f32>,
+        out: ArrayViewMut4<'_, f32>,
+    ) -> Result<(), BoxError> {
+        match &mut self.first {
+            Some((first, calls)) if call.iteration < *calls => first.infer(call, noisy, out),
+            _ => self.then.infer(call, noisy, out),
+        }
+    }
+}
+
 /// A call of the network in a solve.
 #[derive(Debug, Clone)]
 pub struct RecordedCall {

@@ -1,8 +1,8 @@
 //! The denoiser that updates its own network.
 
 use crate::{
-    AdaptConfig, AdaptLoss, Error, PixelSplit, Result, RollBackReason, SplitLoss, SplitRecord, Update, UpdateCounts,
-    UpdateOutcome, accumulate_gradient, adapt_by_splitting,
+    AdaptConfig, AdaptLoss, Error, PixelSplit, Result, RollBackReason, SplitLoss, SplitRecord, Successor, Update,
+    UpdateCounts, UpdateOutcome, accumulate_gradient, adapt_by_splitting,
 };
 use admm::{BoxError, Call, Denoiser};
 use candle_core::{Tensor, Var};
@@ -126,7 +126,7 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         Ok(())
     }
 
-    /// Under [`AdaptLoss::Split`]: [`adapt_by_splitting`] from the present weights, to measurements that are to be solved by `recipe`; under
+    /// Under [`AdaptLoss::Split`]: [`adapt_by_splitting`] from the present weights, to measurements that are to be solved by `recipe` and `successor`; under
     /// the other loss nothing.
     ///
     /// # Errors
@@ -135,6 +135,7 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
         &mut self,
         measurements: &[Measurement],
         recipe: &Recipe,
+        successor: Option<Successor<'_>>,
         watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
     ) -> Result<Option<SplitRecord>>
     where
@@ -142,7 +143,9 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
     {
         match &self.config.loss {
             AdaptLoss::Measurement => Ok(None),
-            AdaptLoss::Split(split) => adapt_by_splitting(&mut self.net, measurements, recipe, split, watch).map(Some),
+            AdaptLoss::Split(split) => {
+                adapt_by_splitting(&mut self.net, measurements, recipe, successor, split, watch).map(Some)
+            }
         }
     }
 

@@ -39,7 +39,7 @@ pub use record::{RollBackReason, Update, UpdateCounts, UpdateOutcome};
 pub use reuse::{Relation, Reuse, Similarity, continuation};
 pub use schedule::UpdateSchedule;
 pub use sequence::{Sequence, SequenceConfig, Solved, Task, run_sequence};
-pub use split::{Judgement, SplitConfig, SplitRecord, adapt_by_splitting};
+pub use split::{Judgement, SplitConfig, SplitRecord, Successor, adapt_by_splitting};
 
 /// A result of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

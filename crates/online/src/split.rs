@@ -10,7 +10,8 @@
 //! ```
 //!
 //! through the last calls of the solve. A share J of the pixels is in no S and given to no solve of these: by the prediction of J the average
-//! of the weights is judged, and weights that predict it worse are not kept.
+//! of the weights is judged, and weights that predict it worse are not kept. Where other networks take the solve over from the one that learned,
+//! J also tells whether they are to: what a network learned of a scene that is like nothing it was trained with, one that did not learn spoils.
 //!
 //! # References
 //! Yaman et al., *Self-supervised learning of physics-guided reconstruction neural networks without fully sampled reference data*, Magnetic
@@ -22,7 +23,7 @@ use candle_core::{Tensor, Var};
 use ndarray::{Array2, Array3, Array4, ArrayView4, Zip, s};
 use nets::kernels::Precision;
 use nets::train::{Adam, blend};
-use nets::unrolled::{Gradients, Recipe};
+use nets::unrolled::{First, Gradients, Recipe, Relay};
 use nets::{Network, Parameters};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -159,6 +160,9 @@ pub struct SplitRecord {
     pub judgements: Vec<Judgement>,
     /// Updates whose weights are in use; 0 when none paid.
     pub kept: usize,
+    /// The error at the pixels that judge after the calls of the network that takes over; nothing where none does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub taken_over: Option<f64>,
     /// Wall-clock seconds it took.
     pub seconds: f64,
 }
@@ -168,10 +172,25 @@ impl SplitRecord {
     pub fn updates(&self) -> usize {
         self.judgements.last().map_or(0, |last| last.updates)
     }
+
+    /// Whether a solve is better off without the network that takes over.
+    pub fn ends_early(&self) -> bool {
+        let kept = self.judgements.iter().find(|judgement| judgement.updates == self.kept);
+        self.taken_over.zip(kept).is_some_and(|(after, kept)| after > kept.judged)
+    }
 }
 
-/// Adapts a network to measurements of one scene, which will be solved by `recipe`. `watch` is told after each update how many are done, and says whether
-/// to go on; stopped early, the best weights so far stay. The same for any number of threads.
+/// A network that takes a solve over from one that learns.
+#[derive(Clone, Copy)]
+pub struct Successor<'n> {
+    /// It, which does not learn.
+    pub network: &'n dyn Network,
+    /// The whole solve; its first calls are those of the one that learns.
+    pub recipe: &'n Recipe,
+}
+
+/// Adapts a network to measurements of one scene, which will be solved by `recipe`, and after that by `successor`, if there is one. `watch` is told after
+/// each update how many are done, and says whether to go on; stopped early, the best weights so far stay. The same for any number of threads.
 ///
 /// # Errors
 /// [`Error::Setting`], [`Error::Net`], [`Error::Denoiser`]; the network has the weights it had then.
@@ -179,6 +198,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
     net: &mut N,
     measurements: &[Measurement],
     recipe: &Recipe,
+    successor: Option<Successor<'_>>,
     config: &SplitConfig,
     watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
 ) -> Result<SplitRecord> {
@@ -214,7 +234,17 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
     if best.1 > 0 {
         net.set_state(&best.2)?;
     }
-    Ok(SplitRecord { judgements, kept: best.1, seconds: begin.elapsed().as_secs_f64() })
+    let calls = recipe.sigmas.len();
+    let taken_over = successor.map(|next| {
+        let first = First { network: net, calls };
+        judged_error(
+            &judged,
+            || next.network.boxed(),
+            |given, then| next.recipe.solve(given, &mut Relay::new(Some(first), &mut **then)),
+        )
+    });
+    let taken_over = taken_over.transpose()?;
+    Ok(SplitRecord { judgements, kept: best.1, taken_over, seconds: begin.elapsed().as_secs_f64() })
 }
 
 /// A measurement with the pixels that judge.
@@ -290,6 +320,18 @@ fn judging_crops(scenes: &[Scene<'_>], config: &SplitConfig) -> Result<Vec<Crop>
     if crops.is_empty() { Err(Error::NothingToJudge) } else { Ok(crops) }
 }
 
+/// The mean error of solves at the pixels that judge; each thread has a network of its own, which packs its filters once.
+fn judged_error<N>(
+    crops: &[Crop],
+    network: impl Fn() -> N + Sync + Send,
+    solve: impl Fn(&Measurement, &mut N) -> nets::Result<Array4<f32>> + Sync,
+) -> Result<f64> {
+    let error =
+        |net: &mut N, crop: &Crop| -> Result<f64> { Ok(f64::from(crop.loss(solve(&crop.given, net)?.view())?.0)) };
+    let errors = crops.par_iter().map_init(network, error).collect::<Result<Vec<_>>>()?;
+    Ok(errors.iter().sum::<f64>() / errors.len() as f64)
+}
+
 impl Crop {
     /// Mean of `(y − H T v)² / Σ C²` over the pixels asked of, and its gradient by v.
     fn loss(&self, v: ArrayView4<'_, f32>) -> std::result::Result<(f32, Array4<f32>), MeasurementError> {
@@ -362,13 +404,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     /// The error of [`Learner::blended`] at the pixels that judge.
     fn judge(&self, crops: &[Crop], recipe: &Recipe) -> Result<f64> {
         let blended = self.constant(&self.blended()?)?;
-        // A network of its own for each thread, which packs its filters once.
-        let error = |net: &mut N, crop: &Crop| -> Result<f64> {
-            let v = recipe.solve(&crop.given, net)?;
-            Ok(f64::from(crop.loss(v.view())?.0))
-        };
-        let errors = crops.par_iter().map_init(|| blended.clone(), error).collect::<Result<Vec<_>>>()?;
-        Ok(errors.iter().sum::<f64>() / errors.len() as f64)
+        judged_error(crops, || blended.clone(), |given, net| recipe.solve(given, net))
     }
 
     /// The weights between those before and the average of those learned, as a state of the network.

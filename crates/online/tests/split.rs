@@ -5,7 +5,7 @@ use ndarray::{Array3, s};
 use nets::kernels::Precision;
 use nets::unrolled::Recipe;
 use nets::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers, Network, Parameters};
-use online::{Error, SplitConfig, SplitRecord, adapt_by_splitting};
+use online::{Error, SplitConfig, SplitRecord, Successor, adapt_by_splitting};
 use sci_forward::testing::{moving_square, uniform};
 use sci_forward::{CfaPattern, MaskOperator, MaskStack, Measurement, SensingOperator, VideoShape};
 use std::collections::BTreeMap;
@@ -36,6 +36,14 @@ fn net(channels: usize) -> Ffdnet {
     Ffdnet::random(FfdnetSpec { channels, width: 8, depth: 3, layout }, 1).unwrap()
 }
 
+/// It adds next to nothing to its input, and is right for most pixels.
+fn faint() -> Ffdnet {
+    let mut net = net(1);
+    let faint = net.state().into_iter().map(|(name, t)| (name, t.affine(0.1, 0.0).unwrap())).collect();
+    net.set_state(&faint).unwrap();
+    net
+}
+
 fn recipe() -> Recipe {
     Recipe { sigmas: vec![0.2, 0.1, 0.05], accelerate: true, start: Some((5, 0.1)), flips: true, dim: 1.5 }
 }
@@ -54,7 +62,7 @@ fn bytes(net: &dyn Network) -> BTreeMap<String, Vec<u32>> {
 
 fn adapt(net: &mut Ffdnet, measurement: &Measurement, config: &SplitConfig) -> SplitRecord {
     let all = std::slice::from_ref(measurement);
-    adapt_by_splitting(net, all, &recipe(), config, &mut |_| ControlFlow::Continue(())).unwrap()
+    adapt_by_splitting(net, all, &recipe(), None, config, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
 /// A network that knows nothing becomes one that predicts pixels better which it never learned from, and solves the whole better.
@@ -91,6 +99,22 @@ fn a_blend_lies_between_the_weights_before_and_those_learned() {
     }
 }
 
+/// Of two networks that take over, one that makes noise spoils what there is, and one that leaves it alone does not.
+#[test]
+fn the_pixels_that_judge_tell_whether_another_network_is_to_take_over() {
+    let (square, loud, quiet) = (measurement(None), net(1), faint());
+    let whole = Recipe { sigmas: vec![0.2, 0.1, 0.05, 0.05], ..recipe() };
+    let taken_over = |first: &Ffdnet, next: &Ffdnet| {
+        let successor = Some(Successor { network: next, recipe: &whole });
+        let mut watch = |_| ControlFlow::Continue(());
+        let all = std::slice::from_ref(&square);
+        adapt_by_splitting(&mut first.clone(), all, &recipe(), successor, &CONFIG, &mut watch).unwrap()
+    };
+    let (spoilt, mended) = (taken_over(&quiet, &loud), taken_over(&loud, &quiet));
+    assert!(spoilt.ends_early(), "{spoilt:?}");
+    assert!(!mended.ends_early() && mended.taken_over < spoilt.taken_over, "{mended:?}");
+}
+
 #[test]
 fn in_color_it_learns_too() {
     let mosaic = measurement(Some(CfaPattern::Gbrg));
@@ -101,10 +125,7 @@ fn in_color_it_learns_too() {
 
 #[test]
 fn weights_that_predict_worse_are_not_kept() {
-    let (mut net, square) = (net(1), measurement(None));
-    // Next to nothing is added to its input: it is right for most pixels.
-    let faint = net.state().into_iter().map(|(name, t)| (name, t.affine(0.1, 0.0).unwrap())).collect();
-    net.set_state(&faint).unwrap();
+    let (mut net, square) = (faint(), measurement(None));
     let before = bytes(&net);
     // Steps this long overshoot.
     let record = adapt(&mut net, &square, &SplitConfig { learning_rate: 1.0, every: 2, ..CONFIG });
@@ -120,7 +141,7 @@ fn several_measurements_are_learned_from_and_a_stop_is_heeded() {
         told.push(updates);
         if updates == 3 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
-    let record = adapt_by_splitting(&mut learned, &all, &recipe(), &CONFIG, &mut watch).unwrap();
+    let record = adapt_by_splitting(&mut learned, &all, &recipe(), None, &CONFIG, &mut watch).unwrap();
     assert_eq!((told, record.updates()), (vec![1, 2, 3], 3));
 }
 
@@ -144,6 +165,6 @@ fn where_nothing_can_judge_it_says_so() {
     let h = MaskOperator::new(MaskStack::new(masks).unwrap());
     let y = uniform((1, 20, 20), 1).slice(s![0, .., ..]).to_owned();
     let one = Measurement::new(Arc::new(h), y).unwrap();
-    let result = adapt_by_splitting(&mut net(1), &[one], &recipe(), &CONFIG, &mut |_| ControlFlow::Continue(()));
+    let result = adapt_by_splitting(&mut net(1), &[one], &recipe(), None, &CONFIG, &mut |_| ControlFlow::Continue(()));
     assert!(matches!(result, Err(Error::NothingToJudge)), "{result:?}");
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use admm::{Observer, Outcome, Plan, Prior, Start, StopRule, Tv};
 use ndarray::ArrayView3;
 use nets::kernels::{Isa, Precision, release_freed_memory};
-use online::{Reuse, Sequence, SplitRecord, Task, Update, UpdateCounts};
+use online::{Reuse, Sequence, SplitRecord, Successor, Task, Update, UpdateCounts};
 use sci_forward::{CfaPattern, Measurement};
 
 use crate::config::{Experiment, Stage};
@@ -24,6 +24,8 @@ pub struct Factory<'e> {
     plan: Plan,
     sequence: Option<Sequence>,
     multiply_adds: MultiplyAdds,
+    /// Whether solves do without the network that takes over from the one that learned.
+    ends_early: bool,
 }
 
 impl<'e> Factory<'e> {
@@ -58,7 +60,7 @@ impl<'e> Factory<'e> {
         };
         plan.hold_out = experiment.judge;
         let sequence = experiment.online.map(|o| Sequence::new(o.sequence)).transpose()?;
-        Ok(Self { experiment, parts, color, plan, sequence, multiply_adds })
+        Ok(Self { experiment, parts, color, plan, sequence, multiply_adds, ends_early: false })
     }
 
     /// The stages and the stop rule.
@@ -81,7 +83,8 @@ impl<'e> Factory<'e> {
         let task = self.begin(&measurement)?;
         let split = self.adapt_by_splitting(scene, left, task.as_ref(), observer)?;
         let done: Vec<usize> = self.learning().map(|(net, _)| net.updates().len()).collect();
-        let plan = task.as_ref().map_or_else(|| self.plan.clone(), |task| task.plan(&self.plan));
+        let plan = self.plan_as_learned();
+        let plan = task.as_ref().map_or_else(|| plan.clone(), |task| task.plan(&plan));
         let mut warm = self.warm_start_prior();
         let normal = self.normal_start(&mut warm, previous);
         let start = match &task {
@@ -112,7 +115,7 @@ impl<'e> Factory<'e> {
     /// # Errors
     /// What [`admm::run`] reports.
     pub fn solve_as_learned(&mut self, scene: &Scene, observer: &mut dyn Follow) -> anyhow::Result<Solved> {
-        let (measurement, plan) = (scene.measurement(0)?, self.plan.clone());
+        let (measurement, plan) = (scene.measurement(0)?, self.plan_as_learned());
         let mut warm = self.warm_start_prior();
         let start = self.normal_start(&mut warm, None);
         let (outcome, work) = self.run(&measurement, start, &plan, observer)?;
@@ -164,11 +167,29 @@ impl<'e> Factory<'e> {
         let measurements =
             used.iter().map(|&k| Ok(given(scene.measurement(k)?))).collect::<anyhow::Result<Vec<_>>>()?;
         let mut watch = |updates| observer.adaptation(updates);
+        let successor = self.experiment.successor.as_ref();
+        let next = successor.and_then(|(index, recipe)| Some((self.parts[*index].network()?.boxed(), recipe)));
+        let next = next.as_ref().map(|(network, recipe)| Successor { network: &**network, recipe });
         let first = self.learning().next();
-        let record = first.map(|(net, _)| net.adapt_by_splitting(&measurements, recipe, &mut watch)).transpose()?;
+        let record =
+            first.map(|(net, _)| net.adapt_by_splitting(&measurements, recipe, next, &mut watch)).transpose()?;
+        let record = record.flatten();
+        self.ends_early = record.as_ref().is_some_and(SplitRecord::ends_early);
         // The solve is to have it: in bands of a large scene it needs all there is.
         release_freed_memory();
-        Ok(record.flatten())
+        Ok(record)
+    }
+
+    /// The plan, without the stages of a network that is better not to take over from the one that learned.
+    fn plan_as_learned(&self) -> Plan {
+        let mut plan = self.plan.clone();
+        let learner = self.experiment.stages[0].denoiser;
+        for (stage, own) in plan.stages.iter_mut().zip(&self.experiment.stages) {
+            if self.ends_early && own.denoiser != learner {
+                stage.iterations = 0;
+            }
+        }
+        plan
     }
 
     /// The TV of a warm start, if the experiment begins with one.
@@ -256,6 +277,9 @@ impl<'e> Factory<'e> {
         self.begin(&scene.measurement(k)?)?;
         if let (Some(sequence), Some(sensor)) = (&mut self.sequence, sensor) {
             sequence.finish(sensor);
+        }
+        if let Some(split) = adaptation.and_then(|a| a.split.as_ref()) {
+            self.ends_early = split.ends_early();
         }
         let mut updates = adaptation.map_or(&[][..], |a| &a.updates);
         let counts = adaptation.map_or(&[][..], |a| &a.updates_of);

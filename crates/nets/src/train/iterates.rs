@@ -2,11 +2,10 @@
 //! network as it is. An iterate is no clean video with white noise; its error has the structure of the masks.
 
 use super::config::IteratesConfig;
-use crate::unrolled::{Recipe, RecordedCall};
+use crate::unrolled::{First, Recipe, RecordedCall, Relay};
 use crate::weights::WeightFile;
 use crate::{Architecture, Ends, Error, Network, Result};
-use admm::{BoxError, Call, Denoiser};
-use ndarray::{ArrayView4, ArrayViewMut4};
+use admm::Denoiser;
 use rand::{Rng, RngExt};
 use sci_forward::Measurement;
 
@@ -34,8 +33,8 @@ impl IteratesConfig {
     }
 
     /// The denoiser of the whole solve: `then` after the calls of the network of [`Self::load_first`].
-    pub(super) fn relay<'d>(&self, first: Option<&dyn Network>, then: &'d mut dyn Network) -> impl Denoiser + 'd {
-        Relay { first: first.map(|first| first.boxed()), calls: self.first_calls(), then }
+    pub(super) fn relay<'d>(&self, first: Option<&dyn Network>, then: &'d mut dyn Network) -> Relay<'d> {
+        Relay::new(first.map(|network| First { network, calls: self.first_calls() }), then)
     }
 
     /// What the solver gives the denoiser in some of the calls of a solve, drawn anew: of [`Self::unrolled`] ones consecutive calls. Iterates
@@ -75,38 +74,15 @@ impl IteratesConfig {
     }
 }
 
-/// A network that takes the solve over from another after so many calls.
-struct Relay<'d> {
-    first: Option<Box<dyn Network>>,
-    calls: usize,
-    then: &'d mut dyn Network,
-}
-
-impl Denoiser for Relay<'_> {
-    fn name(&self) -> &str {
-        "relay"
-    }
-
-    fn denoise(
-        &mut self,
-        call: &Call<'_>,
-        noisy: ArrayView4<'_, f32>,
-        out: ArrayViewMut4<'_, f32>,
-    ) -> std::result::Result<(), BoxError> {
-        match &mut self.first {
-            Some(first) if call.iteration < self.calls => first.infer(call, noisy, out),
-            _ => self.then.infer(call, noisy, out),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::train::camera;
     use crate::train::config::{CameraConfig, FirstCalls, MaskKind};
     use crate::{Ffdnet, FfdnetSpec};
+    use admm::{BoxError, Call};
     use ndarray::Array4;
+    use ndarray::{ArrayView4, ArrayViewMut4};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use sci_forward::CfaPattern;

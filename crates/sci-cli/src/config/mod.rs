@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 
 use crate::bands::Footprint;
 use crate::io::scene::SensorNoise;
-use crate::parts::{Chosen, Demosaicer, first_of_all};
+use crate::parts::{Chosen, Demosaicer, Part, first_of_all};
 use crate::shipped;
 use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
@@ -65,6 +65,8 @@ pub struct Experiment {
     pub online: Option<Online>,
     /// The solve that they learn through, where they do so before it.
     pub recipe: Option<Recipe>,
+    /// The network that takes over from the one that learned, among the denoisers, and the whole solve.
+    pub successor: Option<(usize, Recipe)>,
     /// The memory that a solve may take, in bytes, if it is limited.
     pub memory: Option<usize>,
     /// The pixels that a solve is not given and that judge it, if there are any: with `[skip]` or `judge`.
@@ -256,6 +258,7 @@ fn read(source: &Source, paths: Paths, arguments: &[String]) -> Result<Experimen
         skip,
         online,
         recipe: None,
+        successor: None,
         memory,
         judge: skip.map(|skip| skip.hold_out).or(judge),
         output,
@@ -346,13 +349,25 @@ impl Experiment {
             return Err((key, problem));
         }
         let sigma = |stage: &Stage| std::iter::repeat_n(stage.sigma.unwrap_or(0.0), stage.iterations);
-        self.recipe = accelerate.zip(start).map(|(accelerate, start)| Recipe {
+        let recipe = accelerate.zip(start).map(|(accelerate, start)| Recipe {
             sigmas: self.stages[..leading].iter().flat_map(sigma).collect(),
             accelerate,
             start,
             flips: part.network().is_some_and(|network| network.flips),
             dim: part.network().map_or(1.0, |network| network.dim),
         });
+        // Of what else takes over it cannot be told whether it is to.
+        let next = self.stages.get(leading).map(|stage| stage.denoiser);
+        let alike = |next: &usize| {
+            let seen = |part: &dyn Part| part.network().map(|network| (network.flips, network.dim));
+            seen(&*self.denoisers[*next].part) == seen(&**part)
+                && self.stages[leading..].iter().all(|stage| stage.denoiser == *next)
+        };
+        self.successor = next.filter(alike).zip(recipe.clone()).map(|(next, recipe)| {
+            let sigmas = self.stages.iter().flat_map(sigma).collect();
+            (next, Recipe { sigmas, ..recipe })
+        });
+        self.recipe = recipe;
         Ok(())
     }
 

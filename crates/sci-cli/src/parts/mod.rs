@@ -15,8 +15,9 @@ use std::ops::ControlFlow;
 use std::path::Path;
 
 use admm::{Demosaicked, Denoiser, Prior};
+use nets::Network;
 use nets::unrolled::Recipe;
-use online::{AdaptConfig, SplitRecord, Task, Update};
+use online::{AdaptConfig, SplitRecord, Successor, Task, Update};
 use sci_forward::{CfaPattern, Measurement};
 use serde_json::Value;
 
@@ -138,6 +139,11 @@ pub trait Built: Send {
     /// On what the sensor sees.
     fn on_sensor<'p>(&'p mut self, color: Option<&Sensor>, saving: &mut Saving) -> Box<dyn Prior + 'p>;
 
+    /// As a network, if it is one that denoises.
+    fn network(&self) -> Option<&dyn Network> {
+        None
+    }
+
     /// As what learns, if it does.
     fn learning(&mut self) -> Option<&mut dyn Learning> {
         None
@@ -160,7 +166,7 @@ pub trait Learning {
     /// As [`Task::prepare`].
     fn prepare(&mut self, task: &Task) -> online::Result<()>;
 
-    /// Learns before a solve by `recipe`, where it is to; `watch` is told of each update and says whether to go on.
+    /// Learns before a solve by `recipe` and `successor`, where it is to; `watch` is told of each update and says whether to go on.
     ///
     /// # Errors
     /// As [`online::adapt_by_splitting`].
@@ -168,6 +174,7 @@ pub trait Learning {
         &mut self,
         measurements: &[Measurement],
         recipe: &Recipe,
+        successor: Option<Successor<'_>>,
         watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
     ) -> online::Result<Option<SplitRecord>>;
 

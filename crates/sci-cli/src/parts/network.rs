@@ -8,7 +8,7 @@ use nets::Network;
 use nets::kernels::Precision;
 use nets::unrolled::Recipe;
 use nets::weights::bundled_for_iterates;
-use online::{AdaptiveDenoiser, SplitRecord, Task, Update};
+use online::{AdaptiveDenoiser, SplitRecord, Successor, Task, Update};
 use sci_forward::Measurement;
 
 use super::{Built, Learning, Saving, Sensor, Site, demosaicked};
@@ -72,6 +72,10 @@ impl<N: Network + Denoiser + Clone> Built for Running<N> {
         demosaicked(saving.network(&mut self.net, &self.inference, self.multiply_adds), color)
     }
 
+    fn network(&self) -> Option<&dyn Network> {
+        Some(self.net.network())
+    }
+
     fn learning(&mut self) -> Option<&mut dyn Learning> {
         Some(&mut self.net)
     }
@@ -86,9 +90,10 @@ impl<N: Network + Denoiser + Clone> Learning for AdaptiveDenoiser<N> {
         &mut self,
         measurements: &[Measurement],
         recipe: &Recipe,
+        successor: Option<Successor<'_>>,
         watch: &mut dyn FnMut(usize) -> ControlFlow<()>,
     ) -> online::Result<Option<SplitRecord>> {
-        AdaptiveDenoiser::adapt_by_splitting(self, measurements, recipe, watch)
+        AdaptiveDenoiser::adapt_by_splitting(self, measurements, recipe, successor, watch)
     }
 
     fn save(&mut self, path: &Path) -> online::Result<()> {

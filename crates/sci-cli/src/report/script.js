@@ -307,7 +307,12 @@ function viewer(r, images) {
 function adaptation(measurements) {
   if (!measurements.length) return;
   table(section("Adaptation"), ["measurement", "updates", "error of hidden pixels", "error of judging pixels", "in use", "seconds"],
-    measurements.flatMap(m => m.online.split.judgements.map(j => ({ warning: false, cells: [`${m.index}`, `${j.updates}`, small(j.hidden), small(j.judged), j.updates === m.online.split.kept ? "yes" : "", show(m.online.split.seconds, 1)] }))));
+    measurements.flatMap(m => {
+      const s = m.online.split, kept = s.judgements.find(j => j.updates === s.kept);
+      const row = (updates, hidden, judged, used) => ({ warning: false, cells: [`${m.index}`, updates, small(hidden), small(judged), used ? "yes" : "", show(s.seconds, 1)] });
+      const rows = s.judgements.map(j => row(`${j.updates}`, j.hidden, j.judged, j === kept));
+      return s.taken_over == null ? rows : [...rows, row("the network after it", undefined, s.taken_over, s.taken_over <= kept.judged)];
+    }));
 }
 function run(r, images) {
   head(r);
