@@ -173,12 +173,16 @@ impl SplitRecord {
         self.judgements.last().map_or(0, |last| last.updates)
     }
 
-    /// Whether a solve is better off without the network that takes over.
+    /// Whether a solve is better off without the network that takes over: pixels that judge are predicted worse by more than 2 % after it.
     pub fn ends_early(&self) -> bool {
         let kept = self.judgements.iter().find(|judgement| judgement.updates == self.kept);
-        self.taken_over.zip(kept).is_some_and(|(after, kept)| after > kept.judged)
+        self.taken_over.zip(kept).is_some_and(|(after, kept)| after > (1.0 + TIE) * kept.judged)
     }
 }
+
+/// The share of an error by which few pixels do not tell two solves apart. Five scenes with 1, 1, 1, 4 and 29 % more after the network that takes over:
+/// without it they had .03 dB less, .05 more, .25 less, .16 and .3 more.
+const TIE: f64 = 0.02;
 
 /// A network that takes a solve over from one that learns.
 #[derive(Clone, Copy)]

@@ -6,6 +6,8 @@ use std::ops::RangeInclusive;
 
 /// Rounds through all parameters.
 const ROUNDS: usize = 6;
+/// Steps to a parameter's best without another.
+const ALONE: usize = 4;
 /// Standard deviations by which a value must differ from what was told.
 const APART: f64 = 2.0;
 /// The share of the least error that a simpler answer may cost. TV itself gains some percent from masks with a little more contrast, moved a
@@ -80,8 +82,10 @@ impl<'s> Search<'s> {
                 *step = self.descend(i, *step)?;
             }
         }
+        let least = self.best_errors.total();
+        self.tell_black_from_contrast(&told, least)?;
         let uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
-        let apart = self.leave_as_told(&told, &uncertainties)?;
+        let apart = self.leave_as_told(&told, least, &uncertainties)?;
         let parameters = self.parameters(&uncertainties, &apart);
         Ok(Calibrated {
             mismatch: self.best.mismatch,
@@ -95,7 +99,7 @@ impl<'s> Search<'s> {
 
     fn expected(&self) -> usize {
         let side = 2 * self.reach.floor() as usize + 1;
-        side * side + (3 * ROUNDS + 3 + self.axes.len() / 2) * self.axes.len()
+        side * side + (3 * ROUNDS + 3 + self.axes.len() / 2) * self.axes.len() + 2 * (1 + 3 * ALONE)
     }
 
     fn errors(&mut self, point: &Point) -> Result<Errors, CalibrateError> {
@@ -188,14 +192,41 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
+    /// A black level and less contrast both are light that no mask explains, and a descent by one after the other ends with some of each. Where one
+    /// alone, at its own best, is nearly as good, the better of the two is what is there.
+    fn tell_black_from_contrast(&mut self, told: &Point, least: f64) -> Result<(), CalibrateError> {
+        let named = |name| self.axes.iter().position(|axis| axis.name == name);
+        let (Some(contrast), Some(black)) = (named("contrast"), named("black level")) else { return Ok(()) };
+        let (black_alone, contrast_alone) = (self.alone(black, contrast, told)?, self.alone(contrast, black, told)?);
+        let better = if black_alone.1.total() < contrast_alone.1.total() { black_alone } else { contrast_alone };
+        if better.1.total() <= (1.0 + WORTH) * least {
+            (self.best, self.best_errors) = better;
+        }
+        Ok(())
+    }
+
+    /// The best value of an axis with another as told, from where the search is.
+    fn alone(&mut self, axis: usize, other: usize, told: &Point) -> Result<(Point, Errors), CalibrateError> {
+        let here = (self.best, self.best_errors);
+        self.best = self.with(other, (self.axes[other].get)(told));
+        self.best_errors = self.errors(&{ self.best })?;
+        // The two have shared what there is, so that it is far.
+        let mut step = 4.0 * self.axes[axis].step;
+        for _ in 0..ALONE {
+            step = self.descend(axis, step)?;
+        }
+        let found = (self.best, self.best_errors);
+        (self.best, self.best_errors) = here;
+        Ok(found)
+    }
+
     /// Puts parameters back to what was told, the one that costs least first: those that do not differ from it by more than the data leave
     /// open, then all without which the error stays near the least. Which are left.
-    fn leave_as_told(&mut self, told: &Point, uncertainties: &[f64]) -> Result<Vec<bool>, CalibrateError> {
+    fn leave_as_told(&mut self, told: &Point, least: f64, uncertainties: &[f64]) -> Result<Vec<bool>, CalibrateError> {
         let differs = |(axis, uncertainty): (&Axis, &f64)| {
             ((axis.get)(&self.best) - (axis.get)(told)).abs() > APART * uncertainty
         };
         let mut apart: Vec<bool> = self.axes.iter().zip(uncertainties).map(differs).collect();
-        let least = self.best_errors.total();
         let mut point = self.best;
         for (axis, _) in self.axes.iter().zip(&apart).filter(|(_, apart)| !**apart) {
             (axis.set)(&mut point, (axis.get)(told));

@@ -311,7 +311,7 @@ function adaptation(measurements) {
       const s = m.online.split, kept = s.judgements.find(j => j.updates === s.kept);
       const row = (updates, hidden, judged, used) => ({ warning: false, cells: [`${m.index}`, updates, small(hidden), small(judged), used ? "yes" : "", show(s.seconds, 1)] });
       const rows = s.judgements.map(j => row(`${j.updates}`, j.hidden, j.judged, j === kept));
-      return s.taken_over == null ? rows : [...rows, row("the network after it", undefined, s.taken_over, s.taken_over <= kept.judged)];
+      return s.taken_over == null ? rows : [...rows, row("the network after it", undefined, s.taken_over, s.taken_over <= 1.02 * kept.judged)];
     }));
 }
 function run(r, images) {
