@@ -244,7 +244,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
         judged_error(
             &judged,
             || next.network.boxed(),
-            |given, then| next.recipe.solve(given, &mut Relay::new(Some(first), &mut **then)),
+            |given, then| Ok(next.recipe.solve(given, &mut Relay::new(Some(first), &mut **then))?),
         )
     });
     let taken_over = taken_over.transpose()?;
@@ -328,7 +328,7 @@ fn judging_crops(scenes: &[Scene<'_>], config: &SplitConfig) -> Result<Vec<Crop>
 fn judged_error<N>(
     crops: &[Crop],
     network: impl Fn() -> N + Sync + Send,
-    solve: impl Fn(&Measurement, &mut N) -> nets::Result<Array4<f32>> + Sync,
+    solve: impl Fn(&Measurement, &mut N) -> Result<Array4<f32>> + Sync,
 ) -> Result<f64> {
     let error =
         |net: &mut N, crop: &Crop| -> Result<f64> { Ok(f64::from(crop.loss(solve(&crop.given, net)?.view())?.0)) };
@@ -408,7 +408,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     /// The error of [`Learner::blended`] at the pixels that judge.
     fn judge(&self, crops: &[Crop], recipe: &Recipe) -> Result<f64> {
         let blended = self.constant(&self.blended()?)?;
-        judged_error(crops, || blended.clone(), |given, net| recipe.solve(given, net))
+        judged_error(crops, || blended.clone(), |given, net| Ok(recipe.solve(given, net)?))
     }
 
     /// The weights between those before and the average of those learned, as a state of the network.
