@@ -33,7 +33,7 @@ pub use read::{Arrays, Decided, Video, as_read, of_arrays, read, read_gray_video
 pub use sensor::{Clip, Sensor, SensorNoise};
 pub use shift::MaskShift;
 
-use super::defects::{self, Defects, LeftOut};
+use super::defects::{self, Defect, Defects, LeftOut};
 use super::raw::Raw;
 
 /// The names under which a file holds the parts of a scene.
@@ -285,13 +285,16 @@ impl Scene {
         let Some(masks) = self.operator.masks() else { return Ok(None) };
         let mut mask = MaskStack::from_source(masks)?.view().to_owned();
         let lattice = if self.cfa.is_some() { 2 } else { 1 };
-        let mut found = defects::find(light_through(mask.view()).view(), self.measurements.view(), lattice, 0);
-        if wish == Defects::Exclude && !found.is_empty() {
+        let found = defects::find(light_through(mask.view()).view(), self.measurements.view(), lattice, 0);
+        if wish == Defects::Keep {
+            return Ok(defects::note(&found, wish));
+        }
+        if !found.is_empty() {
             self.left_out.extend(defects::exclude(&found, &mut mask, &mut self.measurements));
             self.operator = operator_of(MaskStack::new(mask)?);
-            found = self.left_out.iter().map(|pixel| pixel.defect).collect();
         }
-        Ok(defects::note(&found, wish))
+        let all: Vec<Defect> = self.left_out.iter().map(|pixel| pixel.defect).collect();
+        Ok(defects::note(&all, wish))
     }
 
     /// A wrong scale gives a plausible but wrong picture, so it is worth a look at the numbers; `brightest` is what white measures at
