@@ -7,7 +7,7 @@
 //!
 //! A shift is looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in
 //! turn by parabolas through three values, with steps that shrink. What the data cannot tell stays as it was told: a parameter whose
-//! value is less than twice its uncertainty from that, or without which the error is less than 15 % above the least. How much light
+//! value is less than twice its uncertainty from that, or without which the error is less than 12 % above the least. How much light
 //! each frame gets is told apart from that, by what is even ([`Exposure`]). Light at the ends of the exposure
 //! ([`MaskMismatch::ends`]) that comes through no mask is not looked for: where
 //! nothing moves it is the same as less contrast, and with both, runner lost 3.5 dB of what is won back without.

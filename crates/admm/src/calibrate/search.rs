@@ -12,7 +12,7 @@ const ALONE: usize = 4;
 const APART: f64 = 2.0;
 /// The share of the least error that a simpler answer may cost. TV itself gains some percent from masks with a little more contrast, moved a
 /// little with the scene: without this, runner's right masks were moved by 0.1 pixels, at 5.8 dB; a tenth was too little for masks that shift along with it.
-const WORTH: f64 = 0.15;
+const WORTH: f64 = 0.12;
 
 /// A coordinate of the search.
 #[derive(Clone, Copy)]
