@@ -111,8 +111,8 @@ fn the_pixels_that_judge_tell_whether_another_network_is_to_take_over() {
         adapt_by_splitting(&mut first.clone(), all, &recipe(), successor, &CONFIG, &mut watch).unwrap()
     };
     let (spoilt, mended) = (taken_over(&quiet, &loud), taken_over(&loud, &quiet));
-    assert!(spoilt.ends_early(), "{spoilt:?}");
-    assert!(!mended.ends_early() && mended.taken_over < spoilt.taken_over, "{mended:?}");
+    assert!(spoilt.ends_early, "{spoilt:?}");
+    assert!(!mended.ends_early && mended.taken_over < spoilt.taken_over, "{mended:?}");
 }
 
 #[test]

@@ -84,7 +84,7 @@ impl<'e> Factory<'e> {
         let split = self.adapt_by_splitting(scene, left, task.as_ref(), observer)?;
         let done: Vec<usize> = self.learning().map(|(net, _)| net.updates().len()).collect();
         let plan = self.plan_as_learned();
-        let plan = task.as_ref().map_or_else(|| plan.clone(), |task| task.plan(&plan));
+        let plan = if let Some(task) = &task { task.plan(&plan) } else { plan };
         let mut warm = self.warm_start_prior();
         let normal = self.normal_start(&mut warm, previous);
         let start = match &task {
@@ -174,7 +174,7 @@ impl<'e> Factory<'e> {
         let record =
             first.map(|(net, _)| net.adapt_by_splitting(&measurements, recipe, next, &mut watch)).transpose()?;
         let record = record.flatten();
-        self.ends_early = record.as_ref().is_some_and(SplitRecord::ends_early);
+        self.ends_early = record.as_ref().is_some_and(|split| split.ends_early);
         // The solve is to have it: in bands of a large scene it needs all there is.
         release_freed_memory();
         Ok(record)
@@ -279,7 +279,7 @@ impl<'e> Factory<'e> {
             sequence.finish(sensor);
         }
         if let Some(split) = adaptation.and_then(|a| a.split.as_ref()) {
-            self.ends_early = split.ends_early();
+            self.ends_early = split.ends_early;
         }
         let mut updates = adaptation.map_or(&[][..], |a| &a.updates);
         let counts = adaptation.map_or(&[][..], |a| &a.updates_of);

@@ -11,7 +11,8 @@ const ALONE: usize = 4;
 /// Standard deviations by which a value must differ from what was told.
 const APART: f64 = 2.0;
 /// The share of the least error that a simpler answer may cost. TV itself gains some percent from masks with a little more contrast, moved a
-/// little with the scene: without this, runner's right masks were moved by 0.1 pixels, at 5.8 dB; a tenth was too little for masks that shift along with it.
+/// little with the scene: without this, runner's right masks were moved by 0.1 pixels, at 5.8 dB; a tenth was too little for masks that
+/// shift along with it.
 const WORTH: f64 = 0.12;
 
 /// A coordinate of the search.
@@ -208,8 +209,8 @@ impl<'s> Search<'s> {
     /// The best value of an axis with another as told, from where the search is.
     fn alone(&mut self, axis: usize, other: usize, told: &Point) -> Result<(Point, Errors), CalibrateError> {
         let here = (self.best, self.best_errors);
-        self.best = self.with(other, (self.axes[other].get)(told));
-        self.best_errors = self.errors(&{ self.best })?;
+        let point = self.with(other, (self.axes[other].get)(told));
+        (self.best, self.best_errors) = (point, self.errors(&point)?);
         // The two have shared what there is, so that it is far.
         let mut step = 4.0 * self.axes[axis].step;
         for _ in 0..ALONE {

@@ -81,8 +81,7 @@ mod tests {
     use crate::train::config::{CameraConfig, FirstCalls, MaskKind};
     use crate::{Ffdnet, FfdnetSpec};
     use admm::{BoxError, Call};
-    use ndarray::Array4;
-    use ndarray::{ArrayView4, ArrayViewMut4};
+    use ndarray::{Array4, ArrayView4, ArrayViewMut4};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use sci_forward::CfaPattern;

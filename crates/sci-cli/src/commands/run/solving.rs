@@ -85,7 +85,7 @@ pub(super) fn line(m: &MeasurementRecord) -> String {
         let warm = if a.warm_start { ", from the result before" } else { "" };
         let cut = if a.cut { ", after a cut" } else { "" };
         let took = a.split.as_ref().map_or(String::new(), |split| {
-            let alone = if split.ends_early() { ", the network after it left out" } else { "" };
+            let alone = if split.ends_early { ", the network after it left out" } else { "" };
             format!(" in {:.1} s{alone}", split.seconds)
         });
         format!("   {} of {} updates kept{took}{warm}{cut}", a.counts.kept, a.counts.fired + a.counts.skipped)

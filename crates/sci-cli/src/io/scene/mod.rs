@@ -284,8 +284,7 @@ impl Scene {
     pub fn look_for_defects(&mut self, wish: Defects) -> Result<Option<String>, MaskError> {
         let Some(masks) = self.operator.masks() else { return Ok(None) };
         let mut mask = MaskStack::from_source(masks)?.view().to_owned();
-        let lattice = if self.cfa.is_some() { 2 } else { 1 };
-        let found = defects::find(light_through(mask.view()).view(), self.measurements.view(), lattice, 0);
+        let found = defects_of(mask.view(), self.measurements.view(), self.cfa.is_some(), 0);
         if wish == Defects::Keep {
             return Ok(defects::note(&found, wish));
         }
@@ -396,6 +395,11 @@ fn brightest_light(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>) -> Opt
         false => &y / &open,
     };
     brightest_hundredth(meas.outer_iter().flat_map(light)).filter(|&bright| bright > 0.0)
+}
+
+/// The defective pixels of measurements `[N, H, W]` of masks `[B, H, W]` that may sit `off` pixels elsewhere.
+fn defects_of(masks: ArrayView3<'_, f32>, meas: ArrayView3<'_, f32>, is_color: bool, off: usize) -> Vec<Defect> {
+    defects::find(light_through(masks).view(), meas, if is_color { 2 } else { 1 }, off)
 }
 
 /// What white measures `[H, W]`; of masks of both signs nothing, as their measurements do not tell how much light there was.

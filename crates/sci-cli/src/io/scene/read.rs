@@ -12,7 +12,7 @@ use super::scale::{self, Content};
 use super::source::Source;
 use super::{
     Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, SensorNoise, Truth, brightest_hundredth,
-    brightest_light, check_size, is_signed, light_through, names, operator_of,
+    brightest_light, check_size, defects_of, is_signed, light_through, names, operator_of,
 };
 use crate::io::defects::LeftOut;
 use crate::io::samples::Array;
@@ -465,8 +465,7 @@ fn look_for_defects(
     is_color: bool,
     notes: &mut Vec<String>,
 ) -> Vec<LeftOut> {
-    let lattice = if is_color { 2 } else { 1 };
-    let found = defects::find(light_through(mask.view()).view(), meas.view(), lattice, reading.masks_off);
+    let found = defects_of(mask.view(), meas.view(), is_color, reading.masks_off);
     if reading.masks_off == 0 {
         notes.extend(defects::note(&found, reading.defects));
     }
