@@ -5,6 +5,7 @@
 //! the pattern as it is then; both put light into the first and last frames that is not theirs. The held-out error does not see a gain: a
 //! frame that is brighter explains as much.
 
+use super::{TILES, squares_of, tile_of};
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use sci_forward::{MaskError, MaskStack, brightness};
 
@@ -21,8 +22,6 @@ const RIDGE: f64 = 3e-3;
 const ROUNDS: usize = 4;
 /// Residuals beyond so many standard deviations are of what is not even.
 const OUTLIER: f64 = 2.5;
-/// Tiles to a side that say how sure the gains are.
-const TILES: usize = 4;
 /// Gains that are all nearer to 1 are left alone, as are those of more frames than this.
 const SLIGHT: f64 = 0.03;
 const MOST_FRAMES: usize = 64;
@@ -71,7 +70,7 @@ impl Exposure {
         }
         let all = extended(masks.view());
         let equal: Vec<f64> = (0..frames + 2).map(|t| if (1..=frames).contains(&t) { 1.0 } else { 0.0 }).collect();
-        let whole: Vec<Array2<bool>> = believed.iter().map(squares_of).collect();
+        let whole: Vec<Array2<bool>> = believed.iter().map(|believed| squares_of(believed, RADIUS + 1)).collect();
         let mut found = Self { gains: equal.clone(), uncertainty: f64::INFINITY };
         for _ in 0..ROUNDS {
             found = Regression::of(&all, measurements, &whole, &found.gains)?.solve(&equal)?;
@@ -200,21 +199,6 @@ impl Regression {
     }
 }
 
-/// The pixels of which the brightness and its slope come from believed pixels only.
-fn squares_of(believed: &Array2<bool>) -> Array2<bool> {
-    let reach = RADIUS + 1;
-    let mut whole = believed.clone();
-    for axis in [Axis(0), Axis(1)] {
-        for mut lane in whole.lanes_mut(axis) {
-            let all = lane.to_vec();
-            let end = all.len();
-            let near = |at: usize| &all[at.saturating_sub(reach)..(at + reach + 1).min(end)];
-            lane.iter_mut().enumerate().for_each(|(at, whole)| *whole = near(at).iter().all(|&believed| believed));
-        }
-    }
-    whole
-}
-
 /// The pixels of a measurement around which it is even, and `whole`.
 fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, whole: &Array2<bool>, open: &Array2<f32>) -> Vec<Pixel> {
     let (height, width) = y.dim();
@@ -229,7 +213,7 @@ fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, whole: &Array2<bool>, open: &
             if whole[[i, j]] && u > 0.02 * middle && down.hypot(right) < EVEN * u {
                 let root = f64::from(u).sqrt();
                 let light = all.slice(s![.., i, j]).iter().map(|&c| f64::from(c) * root).collect();
-                let tile = i * TILES / height * TILES + j * TILES / width;
+                let tile = tile_of((i, j), (height, width));
                 pixels.push(Pixel { tile, light, y: f64::from(y[[i, j]]) / root });
             }
         }

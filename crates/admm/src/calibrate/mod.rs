@@ -6,19 +6,22 @@
 //! Clipped pixels only say that there was at least so much light: they are not asked what there was.
 //!
 //! A shift is looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in
-//! turn by parabolas through three values, with steps that shrink. What the data cannot tell stays as it was told: a parameter whose
+//! turn by parabolas through three values, with steps that shrink. A black level and less contrast are told apart by the pixels that masks
+//! leave nearly closed ([`level`]), where there are such. What the data cannot tell stays as it was told: a parameter whose
 //! value is less than twice its uncertainty from that, or without which the error is less than 12 % above the least. How much light
 //! each frame gets is told apart from that, by what is even ([`Exposure`]). Light at the ends of the exposure
 //! ([`MaskMismatch::ends`]) that comes through no mask is not looked for: where
 //! nothing moves it is the same as less contrast, and with both, runner lost 3.5 dB of what is won back without.
 
 mod exposure;
+mod level;
 mod search;
 
 pub use exposure::Exposure;
 
 use crate::{Gap, Plan, SolveError, Stage, Start, Tv, run};
-use ndarray::{Array2, Zip};
+use level::Level;
+use ndarray::{Array2, Axis, Zip};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sci_forward::{CfaPattern, MaskError, MaskMismatch, MaskOperator, MaskStack, Measurement, MeasurementError};
@@ -213,19 +216,44 @@ impl Calibration {
         let mut found = Search::new(judge, self, watch).run()?;
         if self.exposure && cfa.is_none() {
             let dark = found.black as f32;
-            let believed: Vec<Array2<bool>> = measurements.iter().map(|y| self.believed(y)).collect();
+            let believed = self.believed(measurements);
             let measurements: Vec<Array2<f32>> = measurements.iter().map(|y| y.mapv(|y| y - dark)).collect();
             found.exposure = Exposure::find(&found.mismatch.apply(masks)?, &measurements, &believed);
         }
         Ok(found)
     }
 
-    /// The pixels of a measurement that say how much light there was.
-    fn believed(&self, y: &Array2<f32>) -> Array2<bool> {
-        let mut believed = y.mapv(|y| self.clip.is_none_or(|level| y < level));
-        self.left_out.iter().for_each(|&at| believed[at] = false);
-        believed
+    /// The pixels of measurements that say how much light there was.
+    fn believed(&self, measurements: &[Array2<f32>]) -> Vec<Array2<bool>> {
+        let of = |y: &Array2<f32>| {
+            let mut believed = y.mapv(|y| self.clip.is_none_or(|level| y < level));
+            self.left_out.iter().for_each(|&at| believed[at] = false);
+            believed
+        };
+        measurements.iter().map(of).collect()
     }
+}
+
+/// Tiles to a side, the errors of each of which have a common cause.
+const TILES: usize = 4;
+
+/// The tile of a pixel.
+fn tile_of((row, column): (usize, usize), (height, width): (usize, usize)) -> usize {
+    row * TILES / height * TILES + column * TILES / width
+}
+
+/// The pixels around which all are believed, so far to each side.
+fn squares_of(believed: &Array2<bool>, reach: usize) -> Array2<bool> {
+    let mut whole = believed.clone();
+    for axis in [Axis(0), Axis(1)] {
+        for mut lane in whole.lanes_mut(axis) {
+            let all = lane.to_vec();
+            let end = all.len();
+            let near = |at: usize| &all[at.saturating_sub(reach)..(at + reach + 1).min(end)];
+            lane.iter_mut().enumerate().for_each(|(at, whole)| *whole = near(at).iter().all(|&believed| believed));
+        }
+    }
+    whole
 }
 
 /// Values of all parameters, those that are not looked for as told.
@@ -254,6 +282,8 @@ struct Judge<'a> {
     clip: Option<f32>,
     /// Pixels that solves are given: neither held out nor left out.
     given: Array2<bool>,
+    /// The pixels of each measurement that say how much light there was.
+    believed: Vec<Array2<bool>>,
     /// The groups of each measurement's pixels that are asked.
     asked: Vec<Array2<Option<u8>>>,
     /// Mean of |y|.
@@ -281,11 +311,10 @@ impl<'a> Judge<'a> {
         });
         let mut given = groups.mapv(|group| group.is_none());
         settings.left_out.iter().for_each(|&at| given[at] = false);
-        let asked_of = |y: &Array2<f32>| {
-            let believed = settings.believed(y);
-            Zip::from(&groups).and(&believed).map_collect(|&group, &believed| group.filter(|_| believed))
-        };
-        let asked: Vec<Array2<Option<u8>>> = measurements.iter().map(asked_of).collect();
+        let believed = settings.believed(measurements);
+        let asked_of =
+            |believed| Zip::from(&groups).and(believed).map_collect(|&group, &believed| group.filter(|_| believed));
+        let asked: Vec<Array2<Option<u8>>> = believed.iter().map(asked_of).collect();
         let square = |y: &Array2<f32>, asked: &Array2<Option<u8>>| {
             Zip::from(y).and(asked).fold(0.0, |sum, &y, group| sum + group.map_or(0.0, |_| f64::from(y).powi(2)))
         };
@@ -293,7 +322,7 @@ impl<'a> Judge<'a> {
         let sum: f64 = measurements.iter().flatten().map(|&y| f64::from(y.abs())).sum();
         let level = sum / measurements.iter().map(Array2::len).sum::<usize>().max(1) as f64;
         let (clip, power) = (settings.clip, power.max(f64::MIN_POSITIVE));
-        Ok(Self { masks, cfa, measurements, clip, given, asked, level, power })
+        Ok(Self { masks, cfa, measurements, clip, given, believed, asked, level, power })
     }
 
     /// E of a mismatch, shared out among the groups.
@@ -313,6 +342,12 @@ impl<'a> Judge<'a> {
             });
         }
         Ok(Errors(errors))
+    }
+
+    /// The black level, for masks that sit as in `point` with their contrast as told.
+    fn level(&self, point: &Point) -> Result<Option<Level>, CalibrateError> {
+        let masks = MaskMismatch { contrast: 1.0, ..point.mismatch }.apply(self.masks)?;
+        Ok(Level::find(&masks, self.cfa, (self.measurements, self.level), &self.believed))
     }
 
     /// H x of the whole sensor, x solved by the pixels given.

@@ -14,6 +14,13 @@ const APART: f64 = 2.0;
 /// little with the scene: without this, runner's right masks were moved by 0.1 pixels, at 5.8 dB; a tenth was too little for masks that
 /// shift along with it.
 const WORTH: f64 = 0.12;
+/// Nearly closed pixels tell black level and contrast if the uncertainty of both is no more than this, and the contrast no further from what was
+/// told: masks that are blurred, or elsewhere, let light fall on them.
+const SURE: f64 = 0.02;
+const LIKE: f64 = 0.15;
+/// The least that either differs from what was told where it does, and in standard deviations.
+const SLIGHT: f64 = 0.01;
+const CLEAR: f64 = 4.0;
 
 /// A coordinate of the search.
 #[derive(Clone, Copy)]
@@ -24,6 +31,13 @@ struct Axis {
     /// The first step.
     step: f64,
     range: (f64, f64),
+}
+
+/// An axis of which it is known otherwise than by the error of held-out pixels whether its value differs from what was told.
+struct Known {
+    axis: usize,
+    uncertainty: f64,
+    differs: bool,
 }
 
 /// All axes that the settings ask for, shifts first.
@@ -84,9 +98,14 @@ impl<'s> Search<'s> {
             }
         }
         let least = self.best_errors.total();
-        self.tell_black_from_contrast(&told, least)?;
-        let uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
-        let apart = self.leave_as_told(&told, least, &uncertainties)?;
+        let known = self.told_by_closed_pixels(&told)?;
+        let least = if known.is_empty() { least } else { self.best_errors.total() };
+        if known.is_empty() {
+            self.tell_black_from_contrast(&told, least)?;
+        }
+        let mut uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
+        known.iter().for_each(|known| uncertainties[known.axis] = known.uncertainty);
+        let apart = self.leave_as_told(&told, least, &uncertainties, &known)?;
         let parameters = self.parameters(&uncertainties, &apart);
         Ok(Calibrated {
             mismatch: self.best.mismatch,
@@ -193,11 +212,35 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
+    /// Black level and contrast as nearly closed pixels tell them, if they do. What is known then.
+    fn told_by_closed_pixels(&mut self, told: &Point) -> Result<Vec<Known>, CalibrateError> {
+        let Some(level) = self.judge.level(&self.best)? else { return Ok(Vec::new()) };
+        let sure = level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
+        if !sure || (level.contrast - 1.0).abs() > LIKE {
+            return Ok(Vec::new());
+        }
+        let mut known = Vec::new();
+        for (name, value, uncertainty) in
+            [("black level", level.black, level.uncertainty[0]), ("contrast", level.contrast, level.uncertainty[1])]
+        {
+            let Some(axis) = self.named(name) else { continue };
+            let as_told = (self.axes[axis].get)(told);
+            let differs = (value - as_told).abs() > SLIGHT.max(CLEAR * uncertainty);
+            self.best = self.with(axis, if differs { value } else { as_told });
+            known.push(Known { axis, uncertainty, differs });
+        }
+        self.best_errors = self.errors(&{ self.best })?;
+        Ok(known)
+    }
+
+    fn named(&self, name: &str) -> Option<usize> {
+        self.axes.iter().position(|axis| axis.name == name)
+    }
+
     /// A black level and less contrast both are light that no mask explains, and a descent by one after the other ends with some of each. Where one
     /// alone, at its own best, is nearly as good, the better of the two is what is there.
     fn tell_black_from_contrast(&mut self, told: &Point, least: f64) -> Result<(), CalibrateError> {
-        let named = |name| self.axes.iter().position(|axis| axis.name == name);
-        let (Some(contrast), Some(black)) = (named("contrast"), named("black level")) else { return Ok(()) };
+        let (Some(contrast), Some(black)) = (self.named("contrast"), self.named("black level")) else { return Ok(()) };
         let (black_alone, contrast_alone) = (self.alone(black, contrast, told)?, self.alone(contrast, black, told)?);
         let better = if black_alone.1.total() < contrast_alone.1.total() { black_alone } else { contrast_alone };
         if better.1.total() <= (1.0 + WORTH) * least {
@@ -211,23 +254,35 @@ impl<'s> Search<'s> {
         let here = (self.best, self.best_errors);
         let point = self.with(other, (self.axes[other].get)(told));
         (self.best, self.best_errors) = (point, self.errors(&point)?);
-        // The two have shared what there is, so that it is far.
-        let mut step = 4.0 * self.axes[axis].step;
-        for _ in 0..ALONE {
-            step = self.descend(axis, step)?;
-        }
+        self.descend_alone(axis)?;
         let found = (self.best, self.best_errors);
         (self.best, self.best_errors) = here;
         Ok(found)
     }
 
-    /// Puts parameters back to what was told, the one that costs least first: those that do not differ from it by more than the data leave
+    /// To the best value of an axis that has shared with another what there is, so that it is far.
+    fn descend_alone(&mut self, axis: usize) -> Result<(), CalibrateError> {
+        let mut step = 4.0 * self.axes[axis].step;
+        for _ in 0..ALONE {
+            step = self.descend(axis, step)?;
+        }
+        Ok(())
+    }
+
+    /// Puts parameters back to what was told, but for those that are `known`, the one that costs least first: those that do not differ from it by more than the data leave
     /// open, then all without which the error stays near the least. Which are left.
-    fn leave_as_told(&mut self, told: &Point, least: f64, uncertainties: &[f64]) -> Result<Vec<bool>, CalibrateError> {
+    fn leave_as_told(
+        &mut self,
+        told: &Point,
+        least: f64,
+        uncertainties: &[f64],
+        known: &[Known],
+    ) -> Result<Vec<bool>, CalibrateError> {
         let differs = |(axis, uncertainty): (&Axis, &f64)| {
             ((axis.get)(&self.best) - (axis.get)(told)).abs() > APART * uncertainty
         };
         let mut apart: Vec<bool> = self.axes.iter().zip(uncertainties).map(differs).collect();
+        known.iter().for_each(|known| apart[known.axis] = known.differs);
         let mut point = self.best;
         for (axis, _) in self.axes.iter().zip(&apart).filter(|(_, apart)| !**apart) {
             (axis.set)(&mut point, (axis.get)(told));
@@ -235,7 +290,7 @@ impl<'s> Search<'s> {
         if point != self.best {
             (self.best, self.best_errors) = (point, self.errors(&point)?);
         }
-        while let Some((axis, point, errors)) = self.cheapest(told, &apart)? {
+        while let Some((axis, point, errors)) = self.cheapest(told, &apart, known)? {
             if errors.total() > (1.0 + WORTH) * least {
                 break;
             }
@@ -246,9 +301,14 @@ impl<'s> Search<'s> {
     }
 
     /// Of the parameters that are apart the one whose return to what was told costs least, with the point and its errors.
-    fn cheapest(&mut self, told: &Point, apart: &[bool]) -> Result<Option<(usize, Point, Errors)>, CalibrateError> {
+    fn cheapest(
+        &mut self,
+        told: &Point,
+        apart: &[bool],
+        known: &[Known],
+    ) -> Result<Option<(usize, Point, Errors)>, CalibrateError> {
         let mut cheapest: Option<(usize, Point, Errors)> = None;
-        for axis in (0..apart.len()).filter(|&axis| apart[axis]) {
+        for axis in (0..apart.len()).filter(|&axis| apart[axis] && known.iter().all(|known| known.axis != axis)) {
             let point = self.with(axis, (self.axes[axis].get)(told));
             let errors = self.errors(&point)?;
             if cheapest.is_none_or(|(_, _, least)| errors.total() < least.total()) {

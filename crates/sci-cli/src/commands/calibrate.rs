@@ -7,7 +7,7 @@ use anyhow::{Context, anyhow};
 use ndarray::Axis;
 use plotters::prelude::*;
 
-use super::run::scene_and_choice;
+use super::run::{say, scene_and_choice};
 use super::{Done, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
@@ -47,7 +47,7 @@ impl Args {
         let out = self.out.clone().unwrap_or_else(default);
         check_folder(&out)?;
         catch_interrupts()?;
-        let (scene, chosen) = scene_and_choice(&experiment)?;
+        let (mut scene, chosen) = scene_and_choice(&experiment)?;
         let Self { reach, clock, .. } = self;
         let settings = admm::Calibration { reach, clock, ..admm::Calibration::default() };
         let found = match shown_on_a_bar(|watch| calibration::find(&scene, &chosen, &settings, watch)) {
@@ -64,6 +64,8 @@ impl Args {
         // Last: where it is, the others are.
         write_atomically(&out.join("calibration.json"), |w| w.write_all(found.to_json().as_bytes()))?;
         found.lines().iter().for_each(|line| outln!("{line}"));
+        found.apply(&mut scene)?;
+        scene.look_for_defects(experiment.data.reading.defects)?.iter().for_each(|note| say(&experiment, note));
         let Calibration { error_before, error_after, solves, .. } = found;
         outln!("held-out error {error_before:.3e} -> {error_after:.3e} after {solves} solves");
         outln!("wrote {0}; use it by --set data.calibration={0}/calibration.json", out.display());

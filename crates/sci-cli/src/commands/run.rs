@@ -245,7 +245,7 @@ fn layout_of(experiment: &Experiment, subject: &Subject, factory: &Factory<'_>) 
 }
 
 /// Says what looks odd about the data of an experiment.
-fn say(experiment: &Experiment, note: &str) {
+pub(super) fn say(experiment: &Experiment, note: &str) {
     eprintln!("warning: {}: {note}", experiment.data.path.display());
 }
 
