@@ -39,9 +39,8 @@ impl Engine {
             }
             let Filters { inputs, outputs, values, bias } = filters;
             // What the matrix unit would not gain from stays in f32, as the input of the first layer does.
-            let precision =
-                if form(isa, opts.precision, inputs) == Form::Half { Precision::Bf16 } else { Precision::F32 };
-            let opts = Conv3x3 { precision, ..opts };
+            let full = isa == Isa::Amx && form(isa, opts.precision, inputs) != Form::Half;
+            let opts = Conv3x3 { precision: if full { Precision::F32 } else { opts.precision }, ..opts };
             let packed = PackedConv::new_on(isa, &values, bias.as_deref(), inputs, outputs, opts)?;
             Ok((if shuffled.contains(&i) { packed } else { packed.giving(result(outputs)) }, opts))
         };

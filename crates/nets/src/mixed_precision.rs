@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// A denoiser that can be told what to multiply.
 pub trait SelectPrecision: Denoiser {
-    /// f32, or bf16 where the processor has a matrix unit for it.
+    /// f32, or 16-bit numbers ([`Precision::Bf16`]).
     fn select_precision(&mut self, precision: Precision);
 }
 
@@ -75,7 +75,7 @@ impl PrecisionCounter {
 /// ```
 pub struct MixedPrecision<'a, D> {
     inner: &'a mut D,
-    has_unit: bool,
+    has_half: bool,
     /// σ for which the error was measured, and the error.
     measured: Option<(Option<f32>, f64)>,
     counter: Arc<PrecisionCounter>,
@@ -84,8 +84,8 @@ pub struct MixedPrecision<'a, D> {
 impl<'a, D: SelectPrecision> MixedPrecision<'a, D> {
     /// Around a denoiser, which works in f32 otherwise.
     pub fn new(inner: &'a mut D) -> Self {
-        let has_unit = Isa::detect().is_ok_and(|isa| isa == Isa::Amx);
-        Self { inner, has_unit, measured: None, counter: Arc::default() }
+        let has_half = Isa::detect().is_ok_and(|isa| isa.half_precision() != "f32");
+        Self { inner, has_half, measured: None, counter: Arc::default() }
     }
 
     /// What was made in bf16 so far, also when the denoiser itself is out of reach.
@@ -127,7 +127,7 @@ impl<D: SelectPrecision> Denoiser for MixedPrecision<'_, D> {
         out: ArrayViewMut4<'_, f32>,
     ) -> Result<(), BoxError> {
         // An error that is not a number is not tolerated.
-        let halved = self.has_unit && call.tolerance > 0.0 && self.error(call, noisy)? <= f64::from(call.tolerance);
+        let halved = self.has_half && call.tolerance > 0.0 && self.error(call, noisy)? <= f64::from(call.tolerance);
         self.counter.add(noisy.len(), if halved { noisy.len() } else { 0 });
         self.inner.select_precision(if halved { Precision::Bf16 } else { Precision::F32 });
         self.inner.denoise(call, noisy, out)

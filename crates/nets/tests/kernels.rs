@@ -538,6 +538,79 @@ fn blocked_images_give_the_bits_of_planes() -> Result<()> {
     Ok(())
 }
 
+/// An image through a convolution of 16-bit numbers.
+fn in_half_precision(isa: Isa, case: &Case, ops: &Operands, x: &[f32]) -> Vec<f32> {
+    let opts = Conv3x3 { precision: Precision::Bf16, ..case.opts(false) };
+    let conv = PackedConv::new_on(isa, &ops.w, Some(&ops.b), case.inputs, case.outputs, opts).expect("valid");
+    let (mut input, mut output) = (Blocked::default(), Blocked::default());
+    input.read_planes(case.inputs, case.height, case.width, x).expect("a whole image");
+    conv.forward(&input, &mut output, &mut Scratch::default()).expect("channels that fit");
+    let [h, w] = case.out();
+    let mut found = vec![f32::NAN; case.outputs * h * w];
+    output.write_planes(&mut found).expect("a whole image");
+    found
+}
+
+/// Those whose 16-bit numbers are integers; the matrix unit has images of its own.
+fn with_integers() -> impl Iterator<Item = Isa> {
+    available().filter(|isa| isa.half_precision() == "int16")
+}
+
+#[test]
+fn products_of_integers_are_near_those_of_f32_whatever_the_unit() {
+    let cases = CASES.iter().filter(|c| c.batch == 1 && c.stride == 1 && c.groups == 1 && c.inputs % LANES == 0);
+    for (seed, c) in cases.enumerate() {
+        let mut ops = c.operands(seed as u64);
+        ops.b.fill(0.0);
+        let e = exact(c, &ops);
+        for isa in with_integers() {
+            for unit in [1.0, 1e-20, 1e20] {
+                let x: Vec<f32> = ops.x.iter().map(|x| x * unit).collect();
+                let found: Vec<f32> = in_half_precision(isa, c, &ops, &x).iter().map(|y| y / unit).collect();
+                let (most, usual) = distance(&found, &e.y);
+                let of = rms(&e.y);
+                println!("{c:?} on {isa:?}: {:.1e}, RMS {:.1e}", most / of, usual / of);
+                assert!(most < 2e-2 * of && usual < 3e-3 * of, "{c:?} on {isa:?}: {most:e}, {usual:e} of {of}");
+            }
+        }
+    }
+}
+
+/// Pixels and filters that are as large as the largest, all of one sign: no sum is too large for its integer.
+#[test]
+fn sums_of_integers_do_not_overflow() {
+    let c = case(1, 256, 16, [8, 8], 1, 1);
+    let mut ops = c.operands(1);
+    ops.w.fill(0.01);
+    ops.b.fill(0.0);
+    let x = vec![3.0; ops.x.len()];
+    for isa in with_integers() {
+        let found = in_half_precision(isa, &c, &ops, &x);
+        let inside = 256.0 * 9.0 * 0.03;
+        assert!((found[3 * 8 + 3] / inside - 1.0).abs() < 1e-3, "{} is not {inside} on {isa:?}", found[3 * 8 + 3]);
+    }
+}
+
+#[test]
+fn images_of_zeros_and_pixels_that_are_not_finite_stay_such_in_integers() {
+    let c = case(1, 32, 20, [5, 300], 1, 1);
+    let ops = c.operands(2);
+    for isa in with_integers() {
+        let zeros = vec![0.0; ops.x.len()];
+        let found = in_half_precision(isa, &c, &ops, &zeros);
+        assert!(found.chunks_exact(5 * 300).zip(&ops.b).all(|(plane, b)| plane.iter().all(|y| y == b)), "{isa:?}");
+        for wrong in [f32::NAN, f32::INFINITY] {
+            let mut x = ops.x.clone();
+            x[2 * c.width + 4] = wrong;
+            let found = in_half_precision(isa, &c, &ops, &x);
+            assert!(found[2 * c.width + 4].is_nan(), "{isa:?}");
+            assert!(found[c.width - 1].is_finite(), "a far pixel on {isa:?}");
+        }
+        let run = |threads| on_threads(threads, || bits(&[in_half_precision(isa, &c, &ops, &ops.x)]));
+        assert!(run(1) == run(3), "{isa:?}");
+    }
+}
+
 #[test]
 fn planes_survive_the_blocked_layout() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);

@@ -323,16 +323,18 @@ impl<'e> Factory<'e> {
         Ok(host::solver_kernel().name())
     }
 
-    /// What networks multiply: bf16 is for the matrix unit only; `halved` is the share that `[skip]` chose it for.
+    /// What networks multiply: `f32`, what 16-bit numbers are on this processor, or `mixed`; `halved` is the share that `[skip]` chose
+    /// these for.
     ///
     /// # Errors
     /// As [`Factory::kernel`].
     pub fn precision_used(&self, halved: f64) -> anyhow::Result<&'static str> {
+        let half = if self.has_network() { Isa::detect()?.half_precision() } else { "f32" };
         let wished = self.precisions().any(|precision| precision == Precision::Bf16);
-        let has_unit = self.has_network() && Isa::detect()? == Isa::Amx;
         let full = self.precisions().any(|precision| precision == Precision::F32);
-        Ok(match (has_unit && wished, has_unit && halved > 0.0) {
-            (true, false) if !full => "bf16",
+        Ok(match (wished, halved > 0.0) {
+            _ if half == "f32" => half,
+            (true, false) if !full => half,
             (false, false) => "f32",
             _ => "mixed",
         })

@@ -13,6 +13,8 @@ use super::{direct, winograd};
 #[derive(Debug)]
 enum Filters {
     Winograd(winograd::Winograd),
+    #[cfg(target_arch = "x86_64")]
+    Integers(winograd::Integers),
     Direct(direct::Direct),
     #[cfg(target_arch = "x86_64")]
     Amx(amx::Amx),
@@ -89,7 +91,7 @@ impl PackedConv {
     }
 
     /// Without bias and ReLU; `isa` is available.
-    #[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables, reason = "f32 without a matrix unit"))]
+    #[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables, reason = "f32 alone"))]
     pub(super) fn pack(isa: Isa, weights: &Weights<'_>, step: Step, precision: Precision) -> Self {
         let (inputs, outputs) = (weights.inputs, weights.outputs);
         let filters = match isa {
@@ -98,6 +100,13 @@ impl PackedConv {
             #[cfg(target_arch = "x86_64")]
             Isa::Amx if prefers_matrix_unit(inputs, weights.groups, step) => {
                 Filters::Amx(amx::Amx::new(weights, step, Form::Split))
+            }
+            #[cfg(target_arch = "x86_64")]
+            _ if precision == Precision::Bf16
+                && winograd::Integers::suits(isa, inputs)
+                && prefers_winograd(inputs, outputs, weights.groups, step) =>
+            {
+                Filters::Integers(winograd::Integers::new(weights, isa.vecs()))
             }
             _ if prefers_winograd(inputs, outputs, weights.groups, step) => {
                 Filters::Winograd(winograd::Winograd::new(weights, isa.vecs()))
@@ -258,6 +267,7 @@ impl PackedConv {
                 Filters::Amx(f) => amx::forward(f, &self.bias, self.floor, strip, store, slot),
                 _ if matches!(store, Store::As(Form::Split | Form::Half)) => self.strip_then_convert(strip, slot),
                 Filters::Winograd(f) => winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot),
+                Filters::Integers(f) => winograd::forward_in_integers(self.isa, f, &self.bias, self.floor, strip, slot),
                 Filters::Direct(f) => direct::forward(self.isa, f, &self.bias, self.floor, strip, slot),
             }
         }

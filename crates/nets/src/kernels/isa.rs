@@ -92,6 +92,26 @@ impl Isa {
         if self.available() { Ok(self) } else { Err(KernelError::MissingIsa(self.name())) }
     }
 
+    /// What inference multiplies where 16-bit numbers are asked for ([`Precision::Bf16`](super::Precision::Bf16)): `bf16` on the matrix unit,
+    /// `int16` where that is faster than f32; else nothing but `f32`.
+    pub fn half_precision(self) -> &'static str {
+        match self {
+            Self::Amx => "bf16",
+            _ if self.multiplies_integers() => "int16",
+            _ => "f32",
+        }
+    }
+
+    /// Whether more 16-bit integers are multiplied in a second than f32 numbers. On AArch64 they are as many.
+    pub(super) fn multiplies_integers(self) -> bool {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => is_x86_feature_detected!("avx512vnni"),
+            Self::Avx2 => true,
+            _ => false,
+        }
+    }
+
     /// Vectors of output channels that one register tile holds (`Simd::VECS`).
     pub(super) fn vecs(self) -> usize {
         if matches!(self, Self::Amx | Self::Avx512) { 2 } else { 1 }

@@ -178,14 +178,20 @@ impl Layer {
         let (weights, outputs) = self.ordered(params, form);
         let bias = &params[self.at + self.weights(params).len()..][..self.biases];
         let bias = (self.biases > 0).then_some(bias);
-        PackedConv::new_on(isa, &weights, bias, self.inputs, outputs, self.opts)
+        let opts = Conv3x3 { precision: self.precision(isa), ..self.opts };
+        PackedConv::new_on(isa, &weights, bias, self.inputs, outputs, opts)
+    }
+
+    /// What it multiplies: gradients are of f32 where there is no matrix unit, not of rounded integers.
+    fn precision(&self, isa: Isa) -> Precision {
+        if isa == Isa::Amx { self.opts.precision } else { Precision::F32 }
     }
 
     /// The gradient by the input, as a convolution of the gradient by the result, with this step.
     fn adjoint(&self, isa: Isa, params: &[f32], step: Step, form: Form) -> Checked<PackedConv> {
         let (weights, outputs) = self.ordered(params, form);
         let weights = Weights::new(&weights, self.inputs, outputs, self.opts.groups)?;
-        Ok(PackedConv::pack(isa, &weights.adjoint(), step, self.opts.precision))
+        Ok(PackedConv::pack(isa, &weights.adjoint(), step, self.precision(isa)))
     }
 
     /// Writes the gradients that are wanted to their places among those of all parameters.

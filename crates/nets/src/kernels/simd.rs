@@ -46,6 +46,32 @@ pub(super) trait Simd: Copy {
     unsafe fn prefetch(_p: *const f32) {}
 }
 
+/// Products of 16-bit integers, two channels at a time.
+///
+/// # Safety
+/// As of [`Simd`], and the instruction set must have them ([`Isa::multiplies_integers`](super::isa::Isa::multiplies_integers)).
+#[cfg(target_arch = "x86_64")]
+pub(super) trait Pairs: Simd {
+    /// [`LANES`] i32 numbers, or as many pairs of i16.
+    type Sums: Copy;
+    /// Zeros.
+    const NO_SUMS: Self::Sums;
+
+    /// The pair at `p` in all lanes.
+    unsafe fn splat_pair(p: *const i16) -> Self::Sums;
+    /// As many pairs as there are lanes.
+    unsafe fn load_pairs(p: *const i16) -> Self::Sums;
+    /// `sums + a₀·b₀ + a₁·b₁`, lane by lane.
+    unsafe fn add_products(a: Self::Sums, b: Self::Sums, sums: Self::Sums) -> Self::Sums;
+    unsafe fn to_single(sums: Self::Sums) -> Self;
+    /// Writes 16 i16 numbers: those nearest, the even one of two.
+    unsafe fn store_rounded(self, p: *mut i16);
+    /// The larger of |self| and `so_far`, which are f32 numbers by their bits; what is not finite is larger than all that is.
+    unsafe fn magnitude(self, so_far: Self::Sums) -> Self::Sums;
+    /// The largest of f32 numbers given by their bits.
+    unsafe fn largest(magnitudes: Self::Sums) -> f32;
+}
+
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Portable([f32; LANES]);
@@ -108,7 +134,7 @@ pub(super) use x86::{Avx2, Avx512};
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::Simd;
+    use super::{LANES, Pairs, Simd};
     use std::arch::x86_64::*;
 
     #[derive(Clone, Copy)]
@@ -188,8 +214,109 @@ mod x86 {
         }
     }
 
+    /// The largest of these bits.
+    #[inline(always)]
+    fn largest(bits: [i32; LANES]) -> f32 {
+        let (mut most, mut i) = (0, 0);
+        while i < LANES {
+            most = if bits[i] > most { bits[i] } else { most };
+            i += 1;
+        }
+        f32::from_bits(most as u32)
+    }
+
+    // SAFETY (all methods): the trait's contract: the caller has AVX-512F and VNNI, and gives valid memory.
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    impl Pairs for Avx512 {
+        type Sums = __m512i;
+        const NO_SUMS: __m512i = unsafe { std::mem::zeroed() };
+
+        #[inline(always)]
+        unsafe fn splat_pair(p: *const i16) -> __m512i {
+            unsafe { _mm512_set1_epi32(p.cast::<i32>().read_unaligned()) }
+        }
+        #[inline(always)]
+        unsafe fn load_pairs(p: *const i16) -> __m512i {
+            unsafe { _mm512_loadu_si512(p.cast()) }
+        }
+        #[inline(always)]
+        unsafe fn add_products(a: __m512i, b: __m512i, sums: __m512i) -> __m512i {
+            unsafe { _mm512_dpwssd_epi32(sums, a, b) }
+        }
+        #[inline(always)]
+        unsafe fn to_single(sums: __m512i) -> Self {
+            Self(unsafe { _mm512_cvtepi32_ps(sums) })
+        }
+        #[inline(always)]
+        unsafe fn store_rounded(self, p: *mut i16) {
+            unsafe { _mm256_storeu_si256(p.cast(), _mm512_cvtsepi32_epi16(_mm512_cvtps_epi32(self.0))) }
+        }
+        #[inline(always)]
+        unsafe fn magnitude(self, so_far: __m512i) -> __m512i {
+            unsafe {
+                let sign = _mm512_set1_epi32(i32::MIN);
+                _mm512_max_epi32(so_far, _mm512_andnot_si512(sign, _mm512_castps_si512(self.0)))
+            }
+        }
+        #[inline(always)]
+        unsafe fn largest(magnitudes: __m512i) -> f32 {
+            largest(unsafe { std::mem::transmute::<__m512i, [i32; LANES]>(magnitudes) })
+        }
+    }
+
     #[derive(Clone, Copy)]
     pub(in super::super) struct Avx2(__m256, __m256);
+
+    // SAFETY (all methods): the trait's contract: the caller has AVX2, and gives valid memory.
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    impl Pairs for Avx2 {
+        type Sums = [__m256i; 2];
+        const NO_SUMS: [__m256i; 2] = unsafe { std::mem::zeroed() };
+
+        #[inline(always)]
+        unsafe fn splat_pair(p: *const i16) -> Self::Sums {
+            unsafe { [_mm256_set1_epi32(p.cast::<i32>().read_unaligned()); 2] }
+        }
+        #[inline(always)]
+        unsafe fn load_pairs(p: *const i16) -> Self::Sums {
+            unsafe { [_mm256_loadu_si256(p.cast()), _mm256_loadu_si256(p.add(LANES).cast())] }
+        }
+        #[inline(always)]
+        unsafe fn add_products(a: Self::Sums, b: Self::Sums, sums: Self::Sums) -> Self::Sums {
+            unsafe {
+                [
+                    _mm256_add_epi32(sums[0], _mm256_madd_epi16(a[0], b[0])),
+                    _mm256_add_epi32(sums[1], _mm256_madd_epi16(a[1], b[1])),
+                ]
+            }
+        }
+        #[inline(always)]
+        unsafe fn to_single(sums: Self::Sums) -> Self {
+            unsafe { Self(_mm256_cvtepi32_ps(sums[0]), _mm256_cvtepi32_ps(sums[1])) }
+        }
+        #[inline(always)]
+        unsafe fn store_rounded(self, p: *mut i16) {
+            unsafe {
+                let packed = _mm256_packs_epi32(_mm256_cvtps_epi32(self.0), _mm256_cvtps_epi32(self.1));
+                // The instruction packs each half of the registers apart.
+                _mm256_storeu_si256(p.cast(), _mm256_permute4x64_epi64::<0b11_01_10_00>(packed));
+            }
+        }
+        #[inline(always)]
+        unsafe fn magnitude(self, so_far: Self::Sums) -> Self::Sums {
+            unsafe {
+                let sign = _mm256_set1_epi32(i32::MIN);
+                [
+                    _mm256_max_epi32(so_far[0], _mm256_andnot_si256(sign, _mm256_castps_si256(self.0))),
+                    _mm256_max_epi32(so_far[1], _mm256_andnot_si256(sign, _mm256_castps_si256(self.1))),
+                ]
+            }
+        }
+        #[inline(always)]
+        unsafe fn largest(magnitudes: Self::Sums) -> f32 {
+            largest(unsafe { std::mem::transmute::<[__m256i; 2], [i32; LANES]>(magnitudes) })
+        }
+    }
 
     // SAFETY (all methods): the trait's contract: the caller has AVX2 and FMA and gives valid memory.
     #[allow(clippy::undocumented_unsafe_blocks)]

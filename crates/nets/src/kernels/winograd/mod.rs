@@ -5,6 +5,12 @@
 //! Summed over input channels, `⊙` is 36 small matrix products. The weight gradient is the adjoint,
 //! `∂g = Gᵀ[Σ (Bᵀ d B) ⊙ (A ∂y Aᵀ)]G`, again 36 products.
 
+#[cfg(target_arch = "x86_64")]
+mod integers;
+
+#[cfg(target_arch = "x86_64")]
+pub(super) use integers::{Integers, forward as forward_in_integers};
+
 use super::blocked::{Pixel, View, ZERO, floats, floats_mut};
 use super::geometry::{GradStrip, Panel, Strip, Weights};
 use super::scratch::Slot;
@@ -105,9 +111,38 @@ unsafe fn written<S: Simd, const N: usize>(row: &[MaybeUninit<S>; N]) -> [S; N] 
     unsafe { row.as_ptr().cast::<[S; N]>().read() }
 }
 
-/// `Bᵀ d B` of the 6×6 pixels at `src`, frequency `f` to `dst + f·step`.
+/// Where the frequencies of a block of tiles go: `[36][Cin/16][MAX_TILES][16]`.
+trait Frequencies<S>: Copy {
+    /// The place of the `i`-th tile.
+    unsafe fn tile(self, i: usize) -> Self;
+    /// Puts frequency `f` of this tile there.
+    unsafe fn put(self, f: usize, v: S);
+}
+
+/// As f32 numbers, frequency `f` at `ptr + f·step`.
+#[derive(Clone, Copy)]
+struct Singles {
+    ptr: *mut f32,
+    step: usize,
+}
+
+impl<S: Simd> Frequencies<S> for Singles {
+    #[inline(always)]
+    unsafe fn tile(self, i: usize) -> Self {
+        // SAFETY: the caller gives the memory.
+        Self { ptr: unsafe { self.ptr.add(i * LANES) }, ..self }
+    }
+
+    #[inline(always)]
+    unsafe fn put(self, f: usize, v: S) {
+        // SAFETY: as above.
+        unsafe { v.store(self.ptr.add(f * self.step)) }
+    }
+}
+
+/// `Bᵀ d B` of the 6×6 pixels at `src`.
 #[inline(always)]
-unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: usize) {
+unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, to: impl Frequencies<S>) {
     // SAFETY: the caller gives the memory of both.
     unsafe {
         let mut t = [[MaybeUninit::<S>::uninit(); SIDE]; SIDE];
@@ -132,7 +167,7 @@ unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: 
             let v = input_1d(written(&t[y]));
             let mut x = 0;
             while x < SIDE {
-                v[x].store(dst.add((y * SIDE + x) * step));
+                to.put(y * SIDE + x, v[x]);
                 x += 1;
             }
             y += 1;
@@ -140,9 +175,17 @@ unsafe fn input_tile<S: Simd>(src: *const f32, row: usize, dst: *mut f32, step: 
     }
 }
 
-/// `max(Aᵀ m A + bias, floor)` of frequencies `m + f·step`, to 4×4 pixels at `dst`.
+/// What is done to a result: `max(scale · x + bias, floor)`.
+#[derive(Clone, Copy)]
+struct Finish<S> {
+    scale: S,
+    bias: S,
+    floor: S,
+}
+
+/// `Aᵀ m A` of frequencies `m + f·step`, finished, to 4×4 pixels at `dst`.
 #[inline(always)]
-unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, bias: S, floor: S, dst: *mut f32, row: usize) {
+unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, finish: Finish<S>, dst: *mut f32, row: usize) {
     // SAFETY: the caller gives the memory of both.
     unsafe {
         let mut t = [[MaybeUninit::<S>::uninit(); SIDE]; TILE];
@@ -167,7 +210,7 @@ unsafe fn output_tile<S: Simd>(m: *const f32, step: usize, bias: S, floor: S, ds
             let v = output_1d(written(&t[y]));
             let mut x = 0;
             while x < TILE {
-                v[x].add(bias).at_least(floor).store(dst.add(y * row + x * LANES));
+                v[x].fma(finish.scale, finish.bias).at_least(finish.floor).store(dst.add(y * row + x * LANES));
                 x += 1;
             }
             y += 1;
@@ -336,7 +379,7 @@ unsafe fn forward_strip<S: Simd>(conv: &Winograd, bias: &[Pixel], floor: f32, st
     while let Some(tiles) = Tiles::block(strip.rows, strip.width, i) {
         // SAFETY: `reserve` made room for a block of tiles; the strip's memory is the caller's promise.
         unsafe {
-            input_block::<S>(strip.src, blocks, tiles, v, v_step);
+            input_block::<S>(strip.src, blocks, tiles, Singles { ptr: v, step: v_step });
             let mut u = conv.filters.as_ptr().cast::<f32>();
             let mut p = 0;
             while p < conv.panels.len() {
@@ -356,7 +399,7 @@ unsafe fn forward_strip<S: Simd>(conv: &Winograd, bias: &[Pixel], floor: f32, st
                     u = u.add(conv.input_channels * panel.vecs * LANES);
                     f += 1;
                 }
-                output_block::<S>(m, m_step, panel, bias, floor, tiles, strip);
+                output_block::<S>(m, m_step, panel, bias, [1.0, floor], tiles, strip);
                 p += 1;
             }
         }
@@ -366,9 +409,9 @@ unsafe fn forward_strip<S: Simd>(conv: &Winograd, bias: &[Pixel], floor: f32, st
 
 static NO_BIAS: [Pixel; 2] = [ZERO; 2];
 
-/// Transforms the input of a block of tiles to `v`: `[36][blocks][MAX_TILES][16]`.
+/// Transforms the input of a block of tiles.
 #[inline(always)]
-unsafe fn input_block<S: Simd>(src: View, blocks: usize, tiles: Tiles, v: *mut f32, step: usize) {
+unsafe fn input_block<S: Simd>(src: View, blocks: usize, tiles: Tiles, to: impl Frequencies<S>) {
     let mut b = 0;
     while b < blocks {
         let mut t = 0;
@@ -376,12 +419,8 @@ unsafe fn input_block<S: Simd>(src: View, blocks: usize, tiles: Tiles, v: *mut f
             let (ty, tx) = tiles.at(t);
             // SAFETY: tile (ty, tx) reads padded rows 4ty..4ty+6, which a strip's source has.
             unsafe {
-                input_tile::<S>(
-                    src.ptr.add(b * src.block + ty * TILE * src.row + tx * TILE * LANES),
-                    src.row,
-                    v.add((b * MAX_TILES + t) * LANES),
-                    step,
-                );
+                let pixels = src.ptr.add(b * src.block + ty * TILE * src.row + tx * TILE * LANES);
+                input_tile(pixels, src.row, to.tile(b * MAX_TILES + t));
             }
             t += 1;
         }
@@ -389,14 +428,14 @@ unsafe fn input_block<S: Simd>(src: View, blocks: usize, tiles: Tiles, v: *mut f
     }
 }
 
-/// Transforms the products of a panel back; tiles that stick out of the image are cut.
+/// Transforms the products of a panel back, times `scale`; tiles that stick out of the image are cut.
 #[inline(always)]
 unsafe fn output_block<S: Simd>(
     m: *const f32,
     step: usize,
     panel: Panel,
     bias: &[Pixel],
-    floor: f32,
+    [scale, floor]: [f32; 2],
     tiles: Tiles,
     strip: Strip,
 ) {
@@ -405,8 +444,8 @@ unsafe fn output_block<S: Simd>(
     while v < panel.vecs {
         // SAFETY: `bias` has a pixel for each output block; a tile's valid pixels are inside the strip.
         unsafe {
-            let b = S::load(bias.as_ptr().add(panel.block + v).cast());
-            let floor = S::splat(floor);
+            let bias = S::load(bias.as_ptr().add(panel.block + v).cast());
+            let finish = Finish { scale: S::splat(scale), bias, floor: S::splat(floor) };
             let mut t = 0;
             while t < tiles.count {
                 let (ty, tx) = tiles.at(t);
@@ -414,10 +453,10 @@ unsafe fn output_block<S: Simd>(
                 let src = m.add((v * MAX_TILES + t) * LANES);
                 let dst = strip.dst.ptr.add((panel.block + v) * strip.dst.block + y0 * strip.dst.row + x0 * LANES);
                 if y0 + TILE <= strip.rows && x0 + TILE <= strip.width {
-                    output_tile(src, step, b, floor, dst, strip.dst.row);
+                    output_tile(src, step, finish, dst, strip.dst.row);
                 } else {
                     let whole = cut.as_mut_ptr().cast::<f32>();
-                    output_tile(src, step, b, floor, whole, TILE * LANES);
+                    output_tile(src, step, finish, whole, TILE * LANES);
                     let mut y = 0;
                     while y < TILE.min(strip.rows - y0) {
                         let mut x = 0;
@@ -525,7 +564,7 @@ unsafe fn weight_grad_strip<S: Simd>(plan: &GradPlan, sums: &mut [Pixel], strip:
     while let Some(tiles) = Tiles::block(strip.rows, strip.width, i) {
         // SAFETY: `reserve` made room for a block of tiles; the strip's memory is the caller's promise.
         unsafe {
-            input_block::<S>(strip.input, in_blocks, tiles, v, v_step);
+            input_block::<S>(strip.input, in_blocks, tiles, Singles { ptr: v, step: v_step });
             spread_block::<S>(strip.grad, out_blocks, tiles, m, m_step);
             let mut acc = sums.as_mut_ptr().cast::<f32>();
             let mut p = 0;

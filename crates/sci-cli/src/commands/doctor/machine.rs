@@ -16,15 +16,16 @@ pub(super) fn processor() -> Finding {
         Err(error) => return Finding::broken("processor", format!("{name}: {error}")),
     };
     let solvers = host::solver_kernel().name();
-    let precision = if networks == Isa::Amx {
-        "denoiser.precision = \"bf16\" halves the time of networks"
-    } else {
-        "denoiser.precision = \"bf16\" is done in f32, as there is no matrix unit (AMX) in use"
+    let half = networks.half_precision();
+    let precision = match half {
+        "bf16" => "denoiser.precision = \"bf16\" halves the time of networks",
+        "int16" => {
+            "denoiser.precision = \"bf16\" is done with 16-bit integers, as there is no matrix unit (AMX) in use"
+        }
+        _ => "denoiser.precision = \"bf16\" is done in f32, as there is no matrix unit (AMX) in use",
     };
     let text = format!("{name}: networks use {}, solvers {solvers}; {precision}", networks.name());
-    let bf16 = networks == Isa::Amx;
-    let details =
-        json!({ "name": name, "kernels": sets, "networks": networks.name(), "solvers": solvers, "bf16": bf16 });
+    let details = json!({ "name": name, "kernels": sets, "networks": networks.name(), "solvers": solvers, "half_precision": half });
     Finding::fine("processor", text, details)
 }
 
