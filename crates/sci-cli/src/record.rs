@@ -45,8 +45,7 @@ pub struct Record {
     /// The instruction set that ran: that of the networks' kernels, or of the solver where there is no network.
     #[serde(default)]
     pub kernel: String,
-    /// What networks multiplied: `f32`, `bf16`, or `mixed` where `[skip]` chose; a wish for bf16 that the processor cannot
-    /// fulfil is `f32`.
+    /// What networks multiplied: `f32`, `bf16`, `int16` where 16-bit numbers are asked for and there is no matrix unit, or `mixed`.
     #[serde(default)]
     pub precision_used: String,
     /// Wall-clock seconds of the command up to this record; of one that resumed a run, its own.
@@ -246,7 +245,7 @@ pub struct Skipped {
     pub iterations: usize,
     /// The share of tiles the denoiser left alone, 0 to 1.
     pub tiles: f64,
-    /// The share of what networks did that was in bf16 instead of f32, 0 to 1; left out of the file where it is 0.
+    /// The share of what networks did that was in 16-bit numbers instead of f32, 0 to 1; left out of the file where it is 0.
     #[serde(default, skip_serializing_if = "is_none")]
     pub precision: f64,
     /// Online updates that were due and not made.

@@ -33,7 +33,8 @@ pub enum Precision {
     /// f32.
     #[default]
     F32,
-    /// bf16, 8 bits: twice as fast to train with, and where the processor has no matrix unit for it, f32.
+    /// 16-bit numbers. On a matrix unit bf16, of 8 bits: twice as fast, also to train with. With AVX2, or AVX-512 and VNNI, inference multiplies
+    /// integers, and gradients are of f32; elsewhere all is f32.
     Bf16,
 }
 

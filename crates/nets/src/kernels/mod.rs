@@ -18,6 +18,8 @@
 //! * Elsewhere stride 1 is done by Winograd F(4×4, 3×3) (`winograd`): 32 tiles at a time are transformed, multiplied in 36 small
 //!   matrix products and transformed back with bias and ReLU, so that both transforms (0.3 MB each at 64 channels) and
 //!   most of the filters stay in the second-level cache. The weight gradient is the adjoint of the same steps.
+//! * Inference in 16-bit numbers ([`Precision::Bf16`]) does Winograd's products with integers there (`winograd::integers`): `vpdpwssd` of
+//!   AVX-512, `vpmaddwd` of AVX2.
 //! * Stride 2, its gradient by input (four parities of output pixels), groups and very few input channels are done by
 //!   the definition (`direct`), with the same register tile. Groups cost nothing special: a panel of output channels
 //!   lists the input channels that reach it.
