@@ -267,6 +267,7 @@ impl PackedConv {
                 Filters::Amx(f) => amx::forward(f, &self.bias, self.floor, strip, store, slot),
                 _ if matches!(store, Store::As(Form::Split | Form::Half)) => self.strip_then_convert(strip, slot),
                 Filters::Winograd(f) => winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot),
+                #[cfg(target_arch = "x86_64")]
                 Filters::Integers(f) => winograd::forward_in_integers(self.isa, f, &self.bias, self.floor, strip, slot),
                 Filters::Direct(f) => direct::forward(self.isa, f, &self.bias, self.floor, strip, slot),
             }
