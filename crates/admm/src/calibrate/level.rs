@@ -32,6 +32,7 @@ const MEDIAN_SQUARE: f64 = 0.455;
 pub(super) struct Level {
     /// In units of the mean of |y|.
     pub(super) black: f64,
+    /// At most 1.
     pub(super) contrast: f64,
     /// One standard deviation of both.
     pub(super) uncertainty: [f64; 2],
@@ -135,6 +136,10 @@ fn fit(pixels: &[Pixel]) -> Option<Level> {
             right = [right[0] + weight * a * p.off, right[1] + weight * b * p.off];
         }
         found = solve(normal, right)?;
+        // Pixels that are closed as they were told cannot be more so.
+        if found[0] < 0.0 {
+            found = [0.0, right[1] / normal[2]];
+        }
         variances = variances_of(pixels, |p| left(p, found));
     }
     // Errors of one tile have a common cause: each tile's pull counts once.

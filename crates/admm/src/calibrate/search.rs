@@ -19,7 +19,7 @@ const WORTH: f64 = 0.12;
 const SURE: f64 = 0.02;
 const LIKE: f64 = 0.15;
 /// The least that either differs from what was told where it does, and in standard deviations.
-const SLIGHT: f64 = 0.01;
+const SLIGHT: f64 = 0.025;
 const CLEAR: f64 = 4.0;
 
 /// A coordinate of the search.
@@ -220,16 +220,18 @@ impl<'s> Search<'s> {
             return Ok(Vec::new());
         }
         let mut known = Vec::new();
-        for (name, value, uncertainty) in
-            [("black level", level.black, level.uncertainty[0]), ("contrast", level.contrast, level.uncertainty[1])]
-        {
+        for (name, value, uncertainty) in [
+            ("black level", level.black.max(0.0), level.uncertainty[0]),
+            ("contrast", level.contrast, level.uncertainty[1]),
+        ] {
             let Some(axis) = self.named(name) else { continue };
             let as_told = (self.axes[axis].get)(told);
             let differs = (value - as_told).abs() > SLIGHT.max(CLEAR * uncertainty);
             self.best = self.with(axis, if differs { value } else { as_told });
             known.push(Known { axis, uncertainty, differs });
         }
-        self.best_errors = self.errors(&{ self.best })?;
+        let point = self.best;
+        self.best_errors = self.errors(&point)?;
         Ok(known)
     }
 
@@ -269,8 +271,8 @@ impl<'s> Search<'s> {
         Ok(())
     }
 
-    /// Puts parameters back to what was told, but for those that are `known`, the one that costs least first: those that do not differ from it by more than the data leave
-    /// open, then all without which the error stays near the least. Which are left.
+    /// Puts parameters back to what was told, but for those that are `known`, the one that costs least first: those that do not differ from it
+    /// by more than the data leave open, then all without which the error stays near the least. Which are left.
     fn leave_as_told(
         &mut self,
         told: &Point,
