@@ -8,7 +8,7 @@
 //!
 //! so that `y − S ȳ/k = (1 − S/k)((1 − c) ȳ + c b)`: where little is open, light that no mask explains is a share of what is around it, or the
 //! same everywhere. There the scene's own texture is as little open, so that those pixels, few as they are, tell the two apart; how far pixels
-//! are off, by how much is open, is learned from themselves. The error of held-out pixels does not tell: TV itself gains from less contrast.
+//! are off, by how much is open, is learned from themselves. The error of held-out pixels does not tell: TV itself gains from some.
 
 use super::{squares_of, tile_of};
 use ndarray::{Array2, ArrayView2, Axis, s};

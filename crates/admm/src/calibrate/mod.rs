@@ -344,7 +344,7 @@ impl<'a> Judge<'a> {
         Ok(Errors(errors))
     }
 
-    /// The black level, for masks that sit as in `point` with their contrast as told.
+    /// Black level and contrast as nearly closed pixels tell them, of masks that sit as in `point`.
     fn level(&self, point: &Point) -> Result<Option<Level>, CalibrateError> {
         let masks = MaskMismatch { contrast: 1.0, ..point.mismatch }.apply(self.masks)?;
         Ok(Level::find(&masks, self.cfa, (self.measurements, self.level), &self.believed))

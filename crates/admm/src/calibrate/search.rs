@@ -214,6 +214,9 @@ impl<'s> Search<'s> {
 
     /// Black level and contrast as nearly closed pixels tell them, if they do. What is known then.
     fn told_by_closed_pixels(&mut self, told: &Point) -> Result<Vec<Known>, CalibrateError> {
+        if self.named("black level").or(self.named("contrast")).is_none() {
+            return Ok(Vec::new());
+        }
         let Some(level) = self.judge.level(&self.best)? else { return Ok(Vec::new()) };
         let sure = level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
         if !sure || (level.contrast - 1.0).abs() > LIKE {

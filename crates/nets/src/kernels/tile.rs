@@ -50,7 +50,32 @@ pub(super) unsafe fn product<S: Simd, const STEP: usize>(
     }
 }
 
-/// Cuts a row into the fewest tiles, all nearly equal, so that none is too narrow to hide the latency of its adds.
+/// `in_tiles!(most, count, |done, ROWS| tile)` cuts a row of `count` into the fewest tiles of at most `most`, all nearly equal, so that none is too
+/// narrow to hide the latency of its adds, and runs `tile` for each, with the number of those before it and, as a constant, its own.
+macro_rules! in_tiles {
+    ($most:expr, $count:expr, |$done:ident, $rows:ident| $tile:expr) => {{
+        let tiles = $count.div_ceil($most);
+        let mut $done = 0;
+        let mut i = 0;
+        while i < tiles {
+            let rows = ($count - $done).div_ceil(tiles - i);
+            $crate::kernels::tile::in_tiles!(@ rows, $most, $rows, $tile, 1 2 3 4 5 6 7 8 9 10 11 12 13 14);
+            $done += rows;
+            i += 1;
+        }
+    }};
+    (@ $found:ident, $most:expr, $rows:ident, $tile:expr, $($n:literal)*) => {
+        match $found {
+            $($n if $n <= $most => {
+                const $rows: usize = $n;
+                $tile
+            })*
+            _ => unreachable!("a tile has 1 to {} rows", $most),
+        }
+    };
+}
+pub(super) use in_tiles;
+
 #[inline(always)]
 unsafe fn split<S: Simd, const STEP: usize, const V: usize>(
     count: usize,
@@ -61,28 +86,11 @@ unsafe fn split<S: Simd, const STEP: usize, const V: usize>(
     floor: f32,
     out: Out,
 ) {
-    let tiles = count.div_ceil(S::ROWS);
-    let mut done = 0;
-    let mut i = 0;
-    while i < tiles {
-        let rows = (count - done).div_ceil(tiles - i);
-        // SAFETY: the caller's contract, for the pixels from `done` on.
-        unsafe {
-            let a = a.add(done * STEP);
-            let out = Out { ptr: out.ptr.add(done * out.step), ..out };
-            macro_rules! by_rows {
-                ($($n:literal)*) => {
-                    match rows {
-                        $($n if $n <= S::ROWS => tile::<S, STEP, V, $n>(a, runs, w, init, floor, out),)*
-                        _ => unreachable!("a tile has 1 to ROWS rows"),
-                    }
-                };
-            }
-            by_rows!(1 2 3 4 5 6 7 8 9 10 11 12 13 14);
-        }
-        done += rows;
-        i += 1;
-    }
+    // SAFETY: the caller's contract, for the pixels from `done` on.
+    in_tiles!(S::ROWS, count, |done, ROWS| unsafe {
+        let out = Out { ptr: out.ptr.add(done * out.step), ..out };
+        tile::<S, STEP, V, ROWS>(a.add(done * STEP), runs, w, init, floor, out);
+    });
 }
 
 #[inline(always)]

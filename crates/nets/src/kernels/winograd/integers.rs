@@ -10,7 +10,7 @@ use super::super::geometry::{Panel, Strip, Weights};
 use super::super::isa::Isa;
 use super::super::scratch::Slot;
 use super::super::simd::{Avx2, Avx512, LANES, Pairs};
-use super::super::tile::Out;
+use super::super::tile::{Out, in_tiles};
 use super::{
     FREQUENCIES, Frequencies, MAX_TILES, P, Q, SIDE, TILE, Tiles, filters_of, frequency_step, input_block,
     output_block, transform_filters,
@@ -55,31 +55,23 @@ impl Integers {
 
     pub(in super::super) fn new(weights: &Weights<'_>, vecs: usize) -> Self {
         let panels = Panel::cut(weights.outputs, vecs);
-        let blocks = weights.outputs.div_ceil(LANES);
-        let mut filters = vec![ZERO; FREQUENCIES * weights.inputs / 2 * blocks];
-        let mut scales = vec![ZERO; FREQUENCIES * blocks];
-        let mut rest = (&mut filters[..], &mut scales[..]);
-        let mut jobs = Vec::with_capacity(panels.len());
-        for &panel in &panels {
-            let (filters, others) = rest.0.split_at_mut(FREQUENCIES * weights.inputs / 2 * panel.vecs);
-            let (scales, other_scales) = rest.1.split_at_mut(FREQUENCIES * panel.vecs);
-            jobs.push((panel, filters, scales));
-            rest = (others, other_scales);
-        }
-        jobs.into_par_iter().for_each(|(panel, filters, scales)| pack(weights, panel, filters, scales));
-        Self { blocks: weights.inputs / LANES, panels, filters, scales }
+        let packed: Vec<_> = panels.par_iter().map(|&panel| pack(weights, panel)).collect();
+        let (filters, scales): (Vec<_>, Vec<_>) = packed.into_iter().unzip();
+        Self { blocks: weights.inputs / LANES, panels, filters: filters.concat(), scales: scales.concat() }
     }
 
-    /// Room for the two transforms, and the factors of the first.
+    /// Room for the two transforms.
     fn reserve(&self, slot: &mut Slot) {
         slot.a.grow(FREQUENCIES * frequency_step(self.blocks) / 2);
         slot.b.grow(FREQUENCIES * frequency_step(2));
     }
 }
 
-/// Transforms the filters of a panel, and rounds them.
-fn pack(weights: &Weights<'_>, panel: Panel, filters: &mut [Pixel], scales: &mut [Pixel]) {
+/// The filters of a panel, transformed and rounded, and what sums of them are to be multiplied by.
+fn pack(weights: &Weights<'_>, panel: Panel) -> (Vec<Pixel>, Vec<Pixel>) {
     let cin = weights.inputs;
+    let mut filters = vec![ZERO; FREQUENCIES * (cin / 2) * panel.vecs];
+    let mut scales = vec![ZERO; FREQUENCIES * panel.vecs];
     let mut u = vec![ZERO; FREQUENCIES * cin];
     for v in 0..panel.vecs {
         for c in 0..cin {
@@ -99,6 +91,7 @@ fn pack(weights: &Weights<'_>, panel: Panel, filters: &mut [Pixel], scales: &mut
             }
         }
     }
+    (filters, scales)
 }
 
 /// The pair with another number in that place.
@@ -262,7 +255,6 @@ unsafe fn product<S: Pairs>(
     }
 }
 
-/// As [`split`](super::super::tile) of the f32 numbers.
 #[inline(always)]
 unsafe fn split<S: Pairs, const V: usize>(
     count: usize,
@@ -272,28 +264,11 @@ unsafe fn split<S: Pairs, const V: usize>(
     scale: *const f32,
     out: Out,
 ) {
-    let tiles = count.div_ceil(S::ROWS);
-    let mut done = 0;
-    let mut i = 0;
-    while i < tiles {
-        let rows = (count - done).div_ceil(tiles - i);
-        // SAFETY: the caller's contract, for the tiles from `done` on.
-        unsafe {
-            let a = a.add(done * LANES);
-            let out = Out { ptr: out.ptr.add(done * out.step), ..out };
-            macro_rules! by_rows {
-                ($($n:literal)*) => {
-                    match rows {
-                        $($n if $n <= S::ROWS => tile::<S, V, $n>(a, blocks, w, scale, out),)*
-                        _ => unreachable!("a tile has 1 to ROWS rows"),
-                    }
-                };
-            }
-            by_rows!(1 2 3 4 5 6 7 8 9 10 11 12 13 14);
-        }
-        done += rows;
-        i += 1;
-    }
+    // SAFETY: the caller's contract, for the tiles from `done` on.
+    in_tiles!(S::ROWS, count, |done, ROWS| unsafe {
+        let out = Out { ptr: out.ptr.add(done * out.step), ..out };
+        tile::<S, V, ROWS>(a.add(done * LANES), blocks, w, scale, out);
+    });
 }
 
 #[inline(always)]
