@@ -99,7 +99,6 @@ impl<'s> Search<'s> {
         }
         let least = self.best_errors.total();
         let known = self.told_by_closed_pixels(&told)?;
-        let least = if known.is_empty() { least } else { self.best_errors.total() };
         if known.is_empty() {
             self.tell_black_from_contrast(&told, least)?;
         }
