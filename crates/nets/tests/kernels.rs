@@ -31,7 +31,7 @@ const fn case(
     Case { batch, inputs, outputs, height, width, stride, groups }
 }
 
-const CASES: [Case; 27] = [
+const CASES: [Case; 29] = [
     case(1, 1, 1, [1, 1], 1, 1),
     case(2, 1, 64, [1, 9], 1, 1),
     case(1, 64, 1, [9, 1], 1, 1),
@@ -59,6 +59,8 @@ const CASES: [Case; 27] = [
     case(2, 64, 32, [9, 70], 2, 1),
     case(1, 12, 90, [9, 14], 2, 3),
     case(1, 6, 2, [2, 2], 2, 2),
+    case(1, 2, 3, [1, 1], 2, 1),
+    case(1, 6, 5, [1, 8], 2, 1),
 ];
 
 fn uniform(rng: &mut ChaCha8Rng, len: usize, limit: f32) -> Vec<f32> {
@@ -505,6 +507,16 @@ fn packed(isa: Isa, case: &Case, ops: &Operands, relu: bool) -> PackedConv {
 }
 
 /// Whatever scratch, output and unused lanes held before, the result is that of planes, bit for bit.
+/// Fills the lanes beyond the last channel.
+fn fill_beyond(image: &mut Blocked, value: f32) {
+    let (channels, height, _) = image.shape();
+    let last = image.blocks() - 1;
+    for y in 0..height {
+        let lanes = image.row_mut(last, y).chunks_exact_mut(LANES);
+        lanes.for_each(|pixel| pixel[channels - last * LANES..].fill(value));
+    }
+}
+
 #[test]
 fn blocked_images_give_the_bits_of_planes() -> Result<()> {
     let mut scratch = Scratch::default();
@@ -517,14 +529,7 @@ fn blocked_images_give_the_bits_of_planes() -> Result<()> {
             let nan = vec![f32::NAN; ops.x.len()];
             for x in [&nan, &ops.x] {
                 input.read_planes(c.inputs, c.height, c.width, x).expect("a whole image");
-                for y in 0..c.height {
-                    let last = input.blocks() - 1;
-                    for (i, v) in input.row_mut(last, y).iter_mut().enumerate() {
-                        if last * LANES + i % LANES >= c.inputs {
-                            *v = f32::NAN;
-                        }
-                    }
-                }
+                fill_beyond(&mut input, f32::NAN);
                 conv.forward(&input, &mut output, &mut scratch).expect("channels that fit");
             }
             let [h, w] = c.out();
@@ -540,10 +545,16 @@ fn blocked_images_give_the_bits_of_planes() -> Result<()> {
 
 /// An image through a convolution of 16-bit numbers.
 fn in_half_precision(isa: Isa, case: &Case, ops: &Operands, x: &[f32]) -> Vec<f32> {
+    in_half_precision_beside(isa, case, ops, x, 0.0)
+}
+
+/// The same with `beyond` in the lanes beyond the last channel.
+fn in_half_precision_beside(isa: Isa, case: &Case, ops: &Operands, x: &[f32], beyond: f32) -> Vec<f32> {
     let opts = Conv3x3 { precision: Precision::Bf16, ..case.opts(false) };
     let conv = PackedConv::new_on(isa, &ops.w, Some(&ops.b), case.inputs, case.outputs, opts).expect("valid");
     let (mut input, mut output) = (Blocked::default(), Blocked::default());
     input.read_planes(case.inputs, case.height, case.width, x).expect("a whole image");
+    fill_beyond(&mut input, beyond);
     conv.forward(&input, &mut output, &mut Scratch::default()).expect("channels that fit");
     let [h, w] = case.out();
     let mut found = vec![f32::NAN; case.outputs * h * w];
@@ -558,7 +569,7 @@ fn with_integers() -> impl Iterator<Item = Isa> {
 
 #[test]
 fn products_of_integers_are_near_those_of_f32_whatever_the_unit() {
-    let cases = CASES.iter().filter(|c| c.batch == 1 && c.stride == 1 && c.groups == 1 && c.inputs % LANES == 0);
+    let cases = CASES.iter().filter(|c| c.batch == 1 && (c.inputs / c.groups).is_multiple_of(2));
     for (seed, c) in cases.enumerate() {
         let mut ops = c.operands(seed as u64);
         ops.b.fill(0.0);
@@ -576,38 +587,69 @@ fn products_of_integers_are_near_those_of_f32_whatever_the_unit() {
     }
 }
 
+#[test]
+fn lanes_beyond_the_last_channel_are_not_read_in_integers() {
+    for c in [case(1, 6, 90, [9, 14], 1, 3), case(1, 20, 16, [9, 14], 2, 1), case(1, 90, 32, [9, 14], 1, 1)] {
+        let ops = c.operands(3);
+        for isa in with_integers() {
+            let run = |beyond| bits(&[in_half_precision_beside(isa, &c, &ops, &ops.x, beyond)]);
+            assert!(run(0.0) == run(f32::NAN), "{c:?} on {isa:?}");
+            assert!(run(0.0) == run(1e9), "{c:?} on {isa:?}");
+        }
+    }
+}
+
+#[test]
+fn filters_that_are_not_finite_give_no_finite_result_in_integers() {
+    for c in [case(1, 32, 16, [8, 8], 1, 1), case(1, 32, 16, [8, 8], 2, 1)] {
+        for wrong in [f32::NAN, f32::INFINITY] {
+            let mut ops = c.operands(4);
+            ops.w[4] = wrong;
+            for isa in with_integers() {
+                let found = in_half_precision(isa, &c, &ops, &ops.x);
+                let plane = found.len() / c.outputs;
+                assert!(!found[c.out()[1] + 1].is_finite(), "{c:?} on {isa:?}");
+                assert!(found[plane..].iter().all(|y| y.is_finite()), "{c:?} on {isa:?}");
+            }
+        }
+    }
+}
+
 /// Pixels and filters that are as large as the largest, all of one sign: no sum is too large for its integer.
 #[test]
 fn sums_of_integers_do_not_overflow() {
-    let c = case(1, 256, 16, [8, 8], 1, 1);
-    let mut ops = c.operands(1);
-    ops.w.fill(0.01);
-    ops.b.fill(0.0);
-    let x = vec![3.0; ops.x.len()];
-    for isa in with_integers() {
-        let found = in_half_precision(isa, &c, &ops, &x);
-        let inside = 256.0 * 9.0 * 0.03;
-        assert!((found[3 * 8 + 3] / inside - 1.0).abs() < 1e-3, "{} is not {inside} on {isa:?}", found[3 * 8 + 3]);
+    for c in [case(1, 256, 16, [8, 8], 1, 1), case(1, 256, 16, [8, 8], 2, 1)] {
+        let mut ops = c.operands(1);
+        ops.w.fill(0.01);
+        ops.b.fill(0.0);
+        let x = vec![3.0; ops.x.len()];
+        for isa in with_integers() {
+            let found = in_half_precision(isa, &c, &ops, &x)[c.out()[1] + 1];
+            let inside = 256.0 * 9.0 * 0.03;
+            assert!((found / inside - 1.0).abs() < 5e-3, "{found} is not {inside}, {c:?} on {isa:?}");
+        }
     }
 }
 
 #[test]
 fn images_of_zeros_and_pixels_that_are_not_finite_stay_such_in_integers() {
-    let c = case(1, 32, 20, [5, 300], 1, 1);
-    let ops = c.operands(2);
-    for isa in with_integers() {
-        let zeros = vec![0.0; ops.x.len()];
-        let found = in_half_precision(isa, &c, &ops, &zeros);
-        assert!(found.chunks_exact(5 * 300).zip(&ops.b).all(|(plane, b)| plane.iter().all(|y| y == b)), "{isa:?}");
-        for wrong in [f32::NAN, f32::INFINITY] {
-            let mut x = ops.x.clone();
-            x[2 * c.width + 4] = wrong;
-            let found = in_half_precision(isa, &c, &ops, &x);
-            assert!(found[2 * c.width + 4].is_nan(), "{isa:?}");
-            assert!(found[c.width - 1].is_finite(), "a far pixel on {isa:?}");
+    for c in [case(1, 32, 20, [50, 300], 1, 1), case(1, 32, 20, [50, 300], 2, 1)] {
+        let ops = c.operands(2);
+        let [h, w] = c.out();
+        for isa in with_integers() {
+            let zeros = vec![0.0; ops.x.len()];
+            let found = in_half_precision(isa, &c, &ops, &zeros);
+            assert!(found.chunks_exact(h * w).zip(&ops.b).all(|(plane, b)| plane.iter().all(|y| y == b)), "{isa:?}");
+            for wrong in [f32::NAN, f32::INFINITY] {
+                let mut x = ops.x.clone();
+                x[2 * c.width + 4] = wrong;
+                let found = in_half_precision(isa, &c, &ops, &x);
+                assert!(found[2 / c.stride * w + 4 / c.stride].is_nan(), "{c:?} on {isa:?}");
+                assert!(found[h * w - 1].is_finite(), "a far pixel of {c:?} on {isa:?}");
+            }
+            let run = |threads| on_threads(threads, || bits(&[in_half_precision(isa, &c, &ops, &ops.x)]));
+            assert!(run(1) == run(3), "{c:?} on {isa:?}");
         }
-        let run = |threads| on_threads(threads, || bits(&[in_half_precision(isa, &c, &ops, &ops.x)]));
-        assert!(run(1) == run(3), "{isa:?}");
     }
 }
 

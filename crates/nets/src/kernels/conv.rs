@@ -13,9 +13,11 @@ use super::{direct, winograd};
 #[derive(Debug)]
 enum Filters {
     Winograd(winograd::Winograd),
-    #[cfg(target_arch = "x86_64")]
-    Integers(winograd::Integers),
     Direct(direct::Direct),
+    #[cfg(target_arch = "x86_64")]
+    WinogradInIntegers(winograd::Integers),
+    #[cfg(target_arch = "x86_64")]
+    DirectInIntegers(direct::Integers),
     #[cfg(target_arch = "x86_64")]
     Amx(amx::Amx),
 }
@@ -106,10 +108,14 @@ impl PackedConv {
                 && winograd::Integers::suits(isa, inputs)
                 && prefers_winograd(inputs, outputs, weights.groups, step) =>
             {
-                Filters::Integers(winograd::Integers::new(weights, isa.vecs()))
+                Filters::WinogradInIntegers(winograd::Integers::new(weights, isa.vecs()))
             }
             _ if prefers_winograd(inputs, outputs, weights.groups, step) => {
                 Filters::Winograd(winograd::Winograd::new(weights, isa.vecs()))
+            }
+            #[cfg(target_arch = "x86_64")]
+            _ if precision == Precision::Bf16 && direct::Integers::suits(isa, weights, step) => {
+                Filters::DirectInIntegers(direct::Integers::new(weights, step, isa.vecs()))
             }
             _ => Filters::Direct(direct::Direct::new(weights, step, isa.vecs())),
         };
@@ -267,9 +273,15 @@ impl PackedConv {
                 Filters::Amx(f) => amx::forward(f, &self.bias, self.floor, strip, store, slot),
                 _ if matches!(store, Store::As(Form::Split | Form::Half)) => self.strip_then_convert(strip, slot),
                 Filters::Winograd(f) => winograd::forward(self.isa, f, &self.bias, self.floor, strip, slot),
-                #[cfg(target_arch = "x86_64")]
-                Filters::Integers(f) => winograd::forward_in_integers(self.isa, f, &self.bias, self.floor, strip, slot),
                 Filters::Direct(f) => direct::forward(self.isa, f, &self.bias, self.floor, strip, slot),
+                #[cfg(target_arch = "x86_64")]
+                Filters::WinogradInIntegers(f) => {
+                    winograd::forward_in_integers(self.isa, f, &self.bias, self.floor, strip, slot);
+                }
+                #[cfg(target_arch = "x86_64")]
+                Filters::DirectInIntegers(f) => {
+                    direct::forward_in_integers(self.isa, f, &self.bias, self.floor, strip, slot);
+                }
             }
         }
     }

@@ -11,22 +11,22 @@
 //! * Where the processor has AMX, inference does convolutions of more than 16 channels by the definition on its matrix
 //!   unit (`amx`), each number as the sum of two bf16 ones. Images between the layers of a network stay in that form. The
 //!   error is five times that of AVX-512; 40 iterations of GAP-FFDNet on *traffic* end 2e-5 dB apart.
-//! * Every other multiplication is done by one of two register tiles (`tile`): pixels × 16 or 32 output channels, or, for the
+//! * Every other f32 multiplication is done by one of two register tiles (`tile`): pixels × 16 or 32 output channels, or, for the
 //!   weight gradient, input × output channels. They are written once over a 16-lane vector (`simd`) and compiled for
 //!   AVX-512 (14 × 2 registers), AVX2 with FMA (6 × 2), NEON (6 × 4) and plain Rust. [`Isa::detect`] takes the best that
 //!   the machine has, `SCI_KERNEL=amx|avx512|avx2|neon|portable` another one, [`conv3x3_on`] and [`PackedConv::new_on`] any.
 //! * Elsewhere stride 1 is done by Winograd F(4×4, 3×3) (`winograd`): 32 tiles at a time are transformed, multiplied in 36 small
 //!   matrix products and transformed back with bias and ReLU, so that both transforms (0.3 MB each at 64 channels) and
 //!   most of the filters stay in the second-level cache. The weight gradient is the adjoint of the same steps.
-//! * Inference in 16-bit numbers ([`Precision::Bf16`]) does Winograd's products with integers there (`winograd::integers`): `vpdpwssd` of
-//!   AVX-512, `vpmaddwd` of AVX2.
 //! * Stride 2, its gradient by input (four parities of output pixels), groups and very few input channels are done by
 //!   the definition (`direct`), with the same register tile. Groups cost nothing special: a panel of output channels
 //!   lists the input channels that reach it.
+//! * Inference in 16-bit numbers ([`Precision::Bf16`]) multiplies integers in both ways (`integers`): `vpdpwssd` of AVX-512, `vpmaddwd` of AVX2.
 //! * A result does not depend on the number of threads: strips are independent, every output number is one chain of
 //!   multiply-adds in a fixed order, and the weight gradient is summed in chunks that the shape alone determines. Other
 //!   instruction sets may differ in the last bits.
-//! * Winograd mixes the pixels of a tile: a NaN or an infinity spreads over its 4×4 tile and those next to it.
+//! * Winograd mixes the pixels of a tile: a NaN or an infinity spreads over its 4×4 tile and those next to it; with integers over all tiles, or the
+//!   strip, that have their scale in common.
 //!
 //! What was tried, on which machine, and how large the errors are: `docs/kernels.md`.
 
@@ -40,6 +40,8 @@ mod geometry;
 mod grad;
 #[cfg_attr(not(target_arch = "x86_64"), path = "no_half.rs")]
 mod half;
+#[cfg(target_arch = "x86_64")]
+mod integers;
 mod isa;
 mod memory;
 mod op;

@@ -66,8 +66,8 @@ pub(super) trait Pairs: Simd {
     unsafe fn to_single(sums: Self::Sums) -> Self;
     /// Writes 16 i16 numbers: those nearest, the even one of two.
     unsafe fn store_rounded(self, p: *mut i16);
-    /// The larger of |self| and `so_far`, which are f32 numbers by their bits; what is not finite is larger than all that is.
-    unsafe fn magnitude(self, so_far: Self::Sums) -> Self::Sums;
+    /// The larger of these bits of self and `so_far`, which are f32 numbers of no sign by their bits; what is not finite is larger than all that is.
+    unsafe fn larger(self, bits: Self::Sums, so_far: Self::Sums) -> Self::Sums;
     /// The largest of f32 numbers given by their bits.
     unsafe fn largest(magnitudes: Self::Sums) -> f32;
 }
@@ -252,11 +252,8 @@ mod x86 {
             unsafe { _mm256_storeu_si256(p.cast(), _mm512_cvtsepi32_epi16(_mm512_cvtps_epi32(self.0))) }
         }
         #[inline(always)]
-        unsafe fn magnitude(self, so_far: __m512i) -> __m512i {
-            unsafe {
-                let sign = _mm512_set1_epi32(i32::MIN);
-                _mm512_max_epi32(so_far, _mm512_andnot_si512(sign, _mm512_castps_si512(self.0)))
-            }
+        unsafe fn larger(self, bits: __m512i, so_far: __m512i) -> __m512i {
+            unsafe { _mm512_max_epi32(so_far, _mm512_and_si512(bits, _mm512_castps_si512(self.0))) }
         }
         #[inline(always)]
         unsafe fn largest(magnitudes: __m512i) -> f32 {
@@ -303,12 +300,11 @@ mod x86 {
             }
         }
         #[inline(always)]
-        unsafe fn magnitude(self, so_far: Self::Sums) -> Self::Sums {
+        unsafe fn larger(self, bits: Self::Sums, so_far: Self::Sums) -> Self::Sums {
             unsafe {
-                let sign = _mm256_set1_epi32(i32::MIN);
                 [
-                    _mm256_max_epi32(so_far[0], _mm256_andnot_si256(sign, _mm256_castps_si256(self.0))),
-                    _mm256_max_epi32(so_far[1], _mm256_andnot_si256(sign, _mm256_castps_si256(self.1))),
+                    _mm256_max_epi32(so_far[0], _mm256_and_si256(bits[0], _mm256_castps_si256(self.0))),
+                    _mm256_max_epi32(so_far[1], _mm256_and_si256(bits[1], _mm256_castps_si256(self.1))),
                 ]
             }
         }

@@ -1,4 +1,4 @@
-//! The two register tiles that do all multiplications, direct and Winograd alike.
+//! The two register tiles that do all multiplications of f32 numbers, direct and Winograd alike.
 //!
 //! * [`product`]: a row of pixels times a panel of output channels, summed over input channels (and filter taps);
 //! * [`outer`]: a few input channels times a panel of output channels, summed over pixels, for the weight gradient.

@@ -1,5 +1,11 @@
 //! Convolution by its definition over channel blocks: for strides, groups, few channels and tiny images.
 
+#[cfg(target_arch = "x86_64")]
+mod integers;
+
+#[cfg(target_arch = "x86_64")]
+pub(super) use integers::{Integers, forward as forward_in_integers};
+
 use super::blocked::{Pixel, ZERO};
 use super::geometry::{ChannelRun, GradStrip, Panel, Step, Strip, Weights};
 use super::scratch::Slot;
@@ -12,6 +18,15 @@ struct Tap {
     row: usize,
     column: usize,
     run: ChannelRun,
+}
+
+impl Tap {
+    /// Where its numbers are, in an image with that much between its blocks and its rows.
+    #[inline(always)]
+    fn at(&self, block: usize, row: usize) -> Run {
+        let Self { row: y, column, run } = *self;
+        Run { offset: run.block * block + y * row + column * LANES + run.lane, len: run.len }
+    }
 }
 
 /// One panel of output channels at the output pixels of one parity.
@@ -110,12 +125,7 @@ unsafe fn forward_by<S: Simd, const STEP: usize>(
     while i < conv.parts.len() {
         let Part { panel, ref taps, first, parity: (py, px) } = conv.parts[i];
         slot.runs.clear();
-        for tap in taps {
-            slot.runs.push(Run {
-                offset: tap.run.block * strip.src.block + tap.row * strip.src.row + tap.column * LANES + tap.run.lane,
-                len: tap.run.len,
-            });
-        }
+        slot.runs.extend(taps.iter().map(|tap| tap.at(strip.src.block, strip.src.row)));
         let count = strip.width.saturating_sub(px).div_ceil(out_step);
         let mut y = py;
         while y < strip.rows {
