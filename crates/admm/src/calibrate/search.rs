@@ -1,5 +1,6 @@
 //! From a grid of shifts to parabolas in each parameter.
 
+use super::level::Level;
 use super::{CalibrateError, Calibrated, Calibration, Errors, GROUPS, Judge, Parameter, Point, Progress, Watch};
 use sci_forward::MaskMismatch;
 use std::ops::RangeInclusive;
@@ -18,6 +19,8 @@ const WORTH: f64 = 0.12;
 /// told: masks that are blurred, or elsewhere, let light fall on them.
 const SURE: f64 = 0.02;
 const LIKE: f64 = 0.15;
+/// By so much of their uncertainty masks as told must be surer than masks as found.
+const SURER: f64 = 2.0;
 /// The least that either differs from what was told where it does, and in standard deviations.
 const SLIGHT: f64 = 0.025;
 const CLEAR: f64 = 4.0;
@@ -104,7 +107,13 @@ impl<'s> Search<'s> {
         }
         let mut uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
         known.iter().for_each(|known| uncertainties[known.axis] = known.uncertainty);
-        let apart = self.leave_as_told(&told, least, &uncertainties, &known)?;
+        let mut apart = self.leave_as_told(&told, least, &uncertainties, &known)?;
+        if !known.is_empty() {
+            // Masks may sit elsewhere now.
+            for known in self.told_by_closed_pixels(&told)? {
+                (apart[known.axis], uncertainties[known.axis]) = (known.differs, known.uncertainty);
+            }
+        }
         let parameters = self.parameters(&uncertainties, &apart);
         Ok(Calibrated {
             mismatch: self.best.mismatch,
@@ -211,12 +220,18 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
-    /// Black level and contrast as nearly closed pixels tell them, if they do. What is known then.
+    /// Black level and contrast as nearly closed pixels tell them, if they do, of masks as found, or as told where that is far surer: TV gains from
+    /// masks that moved by some hundredths of a pixel with the scene, and their closed pixels are others. What is known then.
     fn told_by_closed_pixels(&mut self, told: &Point) -> Result<Vec<Known>, CalibrateError> {
         if self.named("black level").or(self.named("contrast")).is_none() {
             return Ok(Vec::new());
         }
-        let Some(level) = self.judge.level(&self.best)? else { return Ok(Vec::new()) };
+        let doubt = |level: &Level| level.uncertainty.iter().sum::<f64>();
+        let level = match (self.judge.level(told)?, self.judge.level(&self.best)?) {
+            (Some(as_told), Some(found)) if SURER * doubt(&as_told) > doubt(&found) => found,
+            (Some(level), _) | (None, Some(level)) => level,
+            (None, None) => return Ok(Vec::new()),
+        };
         let sure = level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
         if !sure || (level.contrast - 1.0).abs() > LIKE {
             return Ok(Vec::new());
