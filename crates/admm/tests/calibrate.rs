@@ -27,7 +27,15 @@ fn measured(truth: &Array3<f32>, real: &MaskMismatch) -> Array2<f32> {
 
 /// Nothing but a shift, in few solves.
 fn shifts() -> Calibration {
-    Calibration { reach: 1.0, rotation: false, scale: false, contrast: false, black: false, ..Calibration::default() }
+    Calibration {
+        reach: 1.0,
+        rotation: false,
+        scale: false,
+        blur: false,
+        contrast: false,
+        black: false,
+        ..Calibration::default()
+    }
 }
 
 fn find(settings: &Calibration, y: Array2<f32>) -> Calibrated {

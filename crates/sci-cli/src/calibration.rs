@@ -33,6 +33,9 @@ pub struct Calibration {
     /// In degrees, from the right down.
     rotation: f64,
     scale: f64,
+    /// Standard deviation, in pixels.
+    #[serde(default)]
+    blur: f64,
     /// Share of the frame before, or after if negative.
     clock: f64,
     contrast: f64,
@@ -113,7 +116,7 @@ fn masks_told(scene: &Scene) -> anyhow::Result<MaskStack> {
 
 impl Calibration {
     fn of(found: admm::Calibrated) -> Self {
-        let MaskMismatch { shift, rotation, scale, clock, contrast, ends, .. } = found.mismatch;
+        let MaskMismatch { shift, rotation, scale, blur, clock, contrast, ends } = found.mismatch;
         let parameters = found.parameters.into_iter().map(|p| Parameter {
             name: p.name.to_owned(),
             value: p.value,
@@ -126,6 +129,7 @@ impl Calibration {
             shift,
             rotation,
             scale,
+            blur,
             clock,
             contrast,
             ends,
@@ -162,8 +166,8 @@ impl Calibration {
 
     /// How masks differ from those told.
     pub fn mismatch(&self) -> MaskMismatch {
-        let Self { shift, rotation, scale, clock, contrast, ends, .. } = *self;
-        MaskMismatch { shift, rotation, scale, clock, contrast, ends, ..MaskMismatch::default() }
+        let Self { shift, rotation, scale, blur, clock, contrast, ends, .. } = *self;
+        MaskMismatch { shift, rotation, scale, blur, clock, contrast, ends }
     }
 
     /// The masks as they are; closed where that comes from beyond the edge of those told, and where they are hardly open, so that what is

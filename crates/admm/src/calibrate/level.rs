@@ -10,12 +10,8 @@
 //! same everywhere. There the scene's own texture is as little open, so that those pixels, few as they are, tell the two apart; how far pixels
 //! are off, by how much is open, is learned from themselves. The error of held-out pixels does not tell: TV itself gains from some.
 
-use super::{squares_of, tile_of};
-use ndarray::{Array2, ArrayView2, Axis, s};
-use sci_forward::{CfaPattern, MaskStack, brightness};
+use super::near::Pixel;
 
-/// Pixels to each side that tell how bright it is around one.
-const RADIUS: usize = 4;
 /// Shares of the usual S between which pixels are as far off as one another.
 const STEPS: [f64; 7] = [0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.2];
 /// Pixels of a step that tell how far it is off; with fewer it is as far as the next.
@@ -38,102 +34,28 @@ pub(super) struct Level {
     pub(super) uncertainty: [f64; 2],
 }
 
-/// A pixel: how far it is from what S says, and what (1 − c) and b c would add to that, all by the brightness around.
-struct Pixel {
-    tile: usize,
-    step: usize,
-    off: f64,
-    by: [f64; 2],
-}
-
-impl Level {
-    /// By measurements and the mean of |y|. Nothing for masks of both signs, or if nothing depends on it. What is not `believed` is not used,
-    /// nor what is near.
-    pub(super) fn find(
-        masks: &MaskStack,
-        cfa: Option<CfaPattern>,
-        (measurements, mean): (&[Array2<f32>], f64),
-        believed: &[Array2<bool>],
-    ) -> Option<Self> {
-        let masks = masks.view();
-        if mean <= 0.0 || masks.iter().any(|&c| c < 0.0) {
-            return None;
-        }
-        let open = masks.sum_axis(Axis(0));
-        // Each color has a brightness of its own.
-        let each = if cfa.is_some() { 2 } else { 1 };
-        let mut pixels = Vec::new();
-        for (y, believed) in measurements.iter().zip(believed) {
-            for (row, column) in (0..each).flat_map(|row| (0..each).map(move |column| (row, column))) {
-                let of = s![row..;each, column..;each];
-                add_pixels(
-                    y.slice(of),
-                    open.slice(of),
-                    &squares_of(&believed.slice(of).to_owned(), RADIUS),
-                    mean,
-                    &mut pixels,
-                );
-            }
-        }
-        fit(&pixels)
-    }
-}
-
-/// Adds the pixels of a measurement, or of one color of it.
-fn add_pixels(
-    y: ArrayView2<'_, f32>,
-    open: ArrayView2<'_, f32>,
-    whole: &Array2<bool>,
-    mean: f64,
-    pixels: &mut Vec<Pixel>,
-) {
-    let (height, width) = y.dim();
-    let ones = Array2::from_elem(y.dim(), 1.0);
-    let usual = f64::from(open.mean().unwrap_or(0.0));
-    let [around, open_around] = [y, open].map(|image| brightness(image, ones.view(), RADIUS));
-    let count = (2 * RADIUS + 1).pow(2) as f64;
-    let others = |mean: f32, own: f32| (count * f64::from(mean) - f64::from(own)) / (count - 1.0);
-    for i in RADIUS..height.saturating_sub(RADIUS) {
-        for j in RADIUS..width.saturating_sub(RADIUS) {
-            let at = [i, j];
-            let (light, open_near) = (others(around[at], y[at]) / mean, others(open_around[at], open[at]));
-            // In the dark nothing is told, and noise would be divided by little.
-            if !whole[at] || open_near < 0.2 * usual || light < 0.05 {
-                continue;
-            }
-            let (y, open) = (f64::from(y[at]) / mean, f64::from(open[at]));
-            let closed = 1.0 - open / open_near;
-            let step = STEPS.iter().take_while(|step| open > **step * usual).count();
-            let tile = tile_of((i, j), (height, width));
-            pixels.push(Pixel {
-                tile,
-                step,
-                off: (y - open / open_near * light) / light,
-                by: [closed, closed / light],
-            });
-        }
-    }
-}
-
 /// Least squares of 1 − c and b c, each pixel weighed by how far those of its step are off.
-fn fit(pixels: &[Pixel]) -> Option<Level> {
+pub(super) fn fit(pixels: &[Pixel]) -> Option<Level> {
     let mut variances: Vec<f64> = (0..=STEPS.len()).map(|step| STEPS[step.min(STEPS.len() - 1)].powi(2)).collect();
     let mut found = [0.0; 2];
-    let left = |p: &Pixel, found: [f64; 2]| p.off - p.by[0] * found[0] - p.by[1] * found[1];
+    let left = |p: &Pixel, found: [f64; 2]| {
+        let (off, by) = p.off();
+        off - by[0] * found[0] - by[1] * found[1]
+    };
     let mut normal = [0.0; 3];
     let mut weights = vec![0.0; pixels.len()];
     for round in 0..ROUNDS {
         for (p, weight) in pixels.iter().zip(&mut weights) {
-            let variance = variances[p.step];
+            let variance = variances[step_of(p)];
             let outlier = round > 0 && left(p, found).powi(2) > OUTLIER.powi(2) * variance;
             *weight = if outlier { 0.0 } else { 1.0 / variance };
         }
         let mut right = [0.0; 2];
         normal = [0.0; 3];
         for (p, weight) in pixels.iter().zip(&weights) {
-            let [a, b] = p.by;
+            let (off, [a, b]) = p.off();
             normal = [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b];
-            right = [right[0] + weight * a * p.off, right[1] + weight * b * p.off];
+            right = [right[0] + weight * a * off, right[1] + weight * b * off];
         }
         found = solve(normal, right)?;
         // Pixels that are closed as they were told cannot be more so.
@@ -146,7 +68,8 @@ fn fit(pixels: &[Pixel]) -> Option<Level> {
     let mut pulls = vec![[0.0; 2]; super::TILES * super::TILES];
     for (p, weight) in pixels.iter().zip(&weights) {
         let pull = weight * left(p, found);
-        (0..2).for_each(|k| pulls[p.tile][k] += pull * p.by[k]);
+        let (_, by) = p.off();
+        (0..2).for_each(|k| pulls[p.tile][k] += pull * by[k]);
     }
     let moves = pulls.into_iter().map(|pull| solve(normal, pull)).collect::<Option<Vec<_>>>()?;
     let deviation = |k: usize| moves.iter().map(|m| m[k] * m[k]).sum::<f64>().sqrt();
@@ -155,10 +78,15 @@ fn fit(pixels: &[Pixel]) -> Option<Level> {
     (contrast > 0.0).then_some(Level { black: found[1] / contrast, contrast, uncertainty })
 }
 
+/// The step of a pixel.
+fn step_of(pixel: &Pixel) -> usize {
+    STEPS.iter().take_while(|step| pixel.share > **step).count()
+}
+
 /// How far the pixels of each step are off; at least a thousandth.
 fn variances_of(pixels: &[Pixel], left: impl Fn(&Pixel) -> f64) -> Vec<f64> {
     let mut squares = vec![Vec::new(); STEPS.len() + 1];
-    pixels.iter().for_each(|p| squares[p.step].push(left(p).powi(2)));
+    pixels.iter().for_each(|p| squares[step_of(p)].push(left(p).powi(2)));
     let mut next = 1.0;
     let mut variances = vec![0.0; squares.len()];
     for (squares, variance) in squares.iter_mut().zip(&mut variances).rev() {
@@ -172,7 +100,7 @@ fn variances_of(pixels: &[Pixel], left: impl Fn(&Pixel) -> f64) -> Vec<f64> {
 }
 
 /// The solution of `[[n₀, n₁], [n₁, n₂]] x = right`.
-fn solve([a, b, c]: [f64; 3], right: [f64; 2]) -> Option<[f64; 2]> {
+pub(super) fn solve([a, b, c]: [f64; 3], right: [f64; 2]) -> Option<[f64; 2]> {
     let determinant = a * c - b * b;
     (determinant > 1e-9 * a * c)
         .then(|| [(c * right[0] - b * right[1]) / determinant, (a * right[1] - b * right[0]) / determinant])
@@ -180,9 +108,10 @@ fn solve([a, b, c]: [f64; 3], right: [f64; 2]) -> Option<[f64; 2]> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::near::Neighbours;
     use super::*;
     use ndarray::Array3;
-    use sci_forward::{MaskMismatch, MaskOperator, SensingOperator, VideoShape};
+    use sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
 
     const SHAPE: VideoShape = VideoShape { frames: 6, height: 96, width: 96 };
 
@@ -198,8 +127,9 @@ mod tests {
         let real = MaskMismatch { contrast, ..MaskMismatch::default() }.apply(masks).unwrap();
         let y = MaskOperator::new(real).forward(scene().view()) + black;
         let mean = f64::from(y.mean().unwrap());
-        let believed = y.mapv(|_| true);
-        Level::find(masks, None, (&[y], mean), &[believed]).map(|level| (level, f64::from(black) / mean))
+        let (believed, groups) = (y.mapv(|_| true), y.mapv(|_| 0));
+        let near = Neighbours::new(masks, None, (&[y], mean), &[believed], &groups, 4)?;
+        near.level(masks.sum().view()).map(|level| (level, f64::from(black) / mean))
     }
 
     #[test]

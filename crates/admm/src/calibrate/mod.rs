@@ -1,27 +1,30 @@
 //! How the masks really sit, from measurements alone.
 //!
-//! Some pixels of each measurement are held out; the others are solved by a few iterations of GAP-TV with masks that are moved, turned,
-//! blended … as [`MaskMismatch`] says, and with a black level taken off. The mismatch with which the video predicts the held-out pixels best
-//! is the one that is there: `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
-//! Clipped pixels only say that there was at least so much light: they are not asked what there was.
+//! Where they sit is told by how well their sum explains each pixel from the brightness around it ([`near`]), which takes no solve. A shift is
+//! looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in turn by parabolas
+//! through three values, with steps that shrink. A black level and less contrast are told apart by the pixels that masks leave nearly closed
+//! ([`level`]), where there are such, else by all.
 //!
-//! A shift is looked for on a grid first (a pattern of single pixels is told from itself moved by less than two), then each parameter in
-//! turn by parabolas through three values, with steps that shrink. A black level and less contrast are told apart by the pixels that masks
-//! leave nearly closed ([`level`]), where there are such. What the data cannot tell stays as it was told: a parameter whose
-//! value is less than twice its uncertainty from that, or without which the error is less than 12 % above the least. How much light
+//! The sum of masks does not tell a share of the neighbouring frame, nor how bright it is around a pixel of masks of both signs. These are found
+//! by pixels that are held out: the others are solved by a few iterations of GAP-TV, and the mismatch with which the video predicts them best
+//! is taken, of `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
+//!
+//! Clipped pixels only say that there was at least so much light: they are not asked. What the data cannot tell stays as it was told: a parameter whose
+//! value is less than twice its uncertainty from that, or, by held-out pixels, without which the error is less than 12 % above the least. How much light
 //! each frame gets is told apart from that, by what is even ([`Exposure`]). Light at the ends of the exposure
 //! ([`MaskMismatch::ends`]) that comes through no mask is not looked for: where
 //! nothing moves it is the same as less contrast, and with both, runner lost 3.5 dB of what is won back without.
 
 mod exposure;
 mod level;
+mod near;
 mod search;
 
 pub use exposure::Exposure;
 
 use crate::{Gap, Plan, SolveError, Stage, Start, Tv, run};
-use level::Level;
 use ndarray::{Array2, Axis, Zip};
+use near::{Neighbours, RADIUS};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sci_forward::{CfaPattern, MaskError, MaskMismatch, MaskOperator, MaskStack, Measurement, MeasurementError};
@@ -48,7 +51,7 @@ const GROUPS: usize = 16;
 /// let real = MaskMismatch { shift: [0.5, 0.0], ..MaskMismatch::default() }.apply(&told)?;
 /// let y = MaskOperator::new(real).forward(Array3::from_shape_fn(shape.dim(), square).view());
 ///
-/// let shifts = Calibration { rotation: false, scale: false, contrast: false, black: false, ..Calibration::default() };
+/// let shifts = Calibration { rotation: false, scale: false, blur: false, contrast: false, black: false, ..Calibration::default() };
 /// let found = shifts.find(&told, None, &[y], &mut |_| std::ops::ControlFlow::Continue(()))?;
 /// assert!((found.mismatch.shift[0] - 0.5).abs() < 0.1, "{found:?}");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
@@ -61,6 +64,8 @@ pub struct Calibration {
     pub rotation: bool,
     /// Whether they may be larger or smaller.
     pub scale: bool,
+    /// Whether they may be blurred.
+    pub blur: bool,
     /// Whether the frame before or after is seen. Off by default: TV lags behind what moves, and a blend of frames makes up for that, so that
     /// 0.05 is found as 0.1 to 0.3. Three clips that are in no benchmark (8, 10 and 14 frames, two mask families, shift, rotation, contrast,
     /// gain, pedestal and noise besides; GAP-TV, mean): with a clock of 0.05 21.99 dB off and 21.99 on, without one 22.22 and 22.03.
@@ -87,6 +92,7 @@ impl Default for Calibration {
             reach: 2.0,
             rotation: true,
             scale: true,
+            blur: true,
             clock: false,
             contrast: true,
             black: true,
@@ -102,15 +108,15 @@ impl Default for Calibration {
 /// A parameter that was looked for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// `shift down`, `shift right`, `rotation`, `scale`, `clock`, `contrast`, `black level`.
+    /// `shift down`, `shift right`, `rotation`, `scale`, `blur`, `clock`, `contrast`, `black level`.
     pub name: &'static str,
-    /// Its value: pixels, pixels, degrees, 1, share, share, share of the mean of y.
+    /// Its value: pixels, pixels, degrees, 1, pixels, share, share, share of the mean of y.
     pub value: f64,
     /// One standard deviation; infinite if the error does not depend on it.
     pub uncertainty: f64,
     /// Whether the value differs from what was told by more than the data leave open; else it is what was told.
     pub told_apart: bool,
-    /// Values that were tried, and E of them, in the order of values.
+    /// Values that were tried, and the errors with them, in the order of values.
     pub curve: Vec<(f64, f64)>,
 }
 
@@ -127,7 +133,7 @@ pub struct Calibrated {
     pub error: [f64; 2],
     /// All that was looked for.
     pub parameters: Vec<Parameter>,
-    /// Solves that it took.
+    /// Mismatches that were tried.
     pub solves: usize,
 }
 
@@ -277,13 +283,15 @@ impl Errors {
 /// What a mismatch is judged by.
 struct Judge<'a> {
     masks: &'a MaskStack,
+    /// Their sum, as one mask.
+    open: MaskStack,
+    /// What the sum is judged by, if it tells something.
+    near: Option<Neighbours>,
     cfa: Option<CfaPattern>,
     measurements: &'a [Array2<f32>],
     clip: Option<f32>,
     /// Pixels that solves are given: neither held out nor left out.
     given: Array2<bool>,
-    /// The pixels of each measurement that say how much light there was.
-    believed: Vec<Array2<bool>>,
     /// The groups of each measurement's pixels that are asked.
     asked: Vec<Array2<Option<u8>>>,
     /// Mean of |y|.
@@ -305,10 +313,10 @@ impl<'a> Judge<'a> {
         }
         let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
         let share = 1.0 / settings.spacing as f64;
-        let groups = Array2::from_shape_simple_fn(masks.shape().image_dim(), || {
-            let group = rng.random_range(0..GROUPS) as u8;
-            (rng.random::<f64>() < share).then_some(group)
+        let drawn = Array2::from_shape_simple_fn(masks.shape().image_dim(), || {
+            (rng.random_range(0..GROUPS) as u8, rng.random::<f64>() < share)
         });
+        let groups = drawn.mapv(|(group, held_out)| held_out.then_some(group));
         let mut given = groups.mapv(|group| group.is_none());
         settings.left_out.iter().for_each(|&at| given[at] = false);
         let believed = settings.believed(measurements);
@@ -322,11 +330,21 @@ impl<'a> Judge<'a> {
         let sum: f64 = measurements.iter().flatten().map(|&y| f64::from(y.abs())).sum();
         let level = sum / measurements.iter().map(Array2::len).sum::<usize>().max(1) as f64;
         let (clip, power) = (settings.clip, power.max(f64::MIN_POSITIVE));
-        Ok(Self { masks, cfa, measurements, clip, given, believed, asked, level, power })
+        let margin = RADIUS + settings.reach.ceil() as usize + 1;
+        let groups = drawn.mapv(|(group, _)| group);
+        let near = Neighbours::new(masks, cfa, (measurements, level), &believed, &groups, margin);
+        let open = MaskStack::new(masks.sum().insert_axis(Axis(0)))?;
+        Ok(Self { masks, open, near, cfa, measurements, clip, given, asked, level, power })
     }
 
-    /// E of a mismatch, shared out among the groups.
-    fn errors(&self, point: &Point) -> Result<Errors, CalibrateError> {
+    /// The sum of masks that sit as in `point`.
+    fn open(&self, point: &Point) -> Result<Array2<f32>, CalibrateError> {
+        let moved = MaskMismatch { clock: 0.0, contrast: 1.0, ends: [0.0; 2], ..point.mismatch };
+        Ok(moved.apply(&self.open)?.sum())
+    }
+
+    /// E of a mismatch by held-out pixels, shared out among the groups.
+    fn held_out(&self, point: &Point) -> Result<Errors, CalibrateError> {
         let masks = point.mismatch.apply(self.masks)?;
         let operator = Arc::new(MaskOperator::new(masks));
         let black = (point.black * self.level) as f32;
@@ -342,12 +360,6 @@ impl<'a> Judge<'a> {
             });
         }
         Ok(Errors(errors))
-    }
-
-    /// Black level and contrast as nearly closed pixels tell them, of masks that sit as in `point`.
-    fn level(&self, point: &Point) -> Result<Option<Level>, CalibrateError> {
-        let masks = MaskMismatch { contrast: 1.0, ..point.mismatch }.apply(self.masks)?;
-        Ok(Level::find(&masks, self.cfa, (self.measurements, self.level), &self.believed))
     }
 
     /// H x of the whole sensor, x solved by the pixels given.

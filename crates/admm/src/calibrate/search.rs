@@ -7,56 +7,60 @@ use std::ops::RangeInclusive;
 
 /// Rounds through all parameters.
 const ROUNDS: usize = 6;
-/// Steps to a parameter's best without another.
-const ALONE: usize = 4;
 /// Standard deviations by which a value must differ from what was told.
 const APART: f64 = 2.0;
-/// The share of the least error that a simpler answer may cost. TV itself gains some percent from masks with a little more contrast, moved a
-/// little with the scene: without this, runner's right masks were moved by 0.1 pixels, at 5.8 dB; a tenth was too little for masks that
-/// shift along with it.
+/// The share of the least error that a simpler answer may cost, by held-out pixels. TV itself gains some percent from a blend of frames.
 const WORTH: f64 = 0.12;
 /// Nearly closed pixels tell black level and contrast if the uncertainty of both is no more than this, and the contrast no further from what was
 /// told: masks that are blurred, or elsewhere, let light fall on them.
 const SURE: f64 = 0.02;
 const LIKE: f64 = 0.15;
-/// By so much of their uncertainty masks as told must be surer than masks as found.
-const SURER: f64 = 2.0;
-/// The least that either differs from what was told where it does, and in standard deviations.
-const SLIGHT: f64 = 0.025;
-const CLEAR: f64 = 4.0;
+
+/// What tells a parameter.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum By {
+    /// The brightness around each pixel.
+    Neighbours,
+    /// Pixels that are not given to a solve.
+    HeldOut,
+    /// Nearly closed pixels.
+    Closed,
+}
 
 /// A coordinate of the search.
 #[derive(Clone, Copy)]
 struct Axis {
     name: &'static str,
+    by: By,
     get: fn(&Point) -> f64,
     set: fn(&mut Point, f64),
     /// The first step.
     step: f64,
+    /// What a scene may imitate: a value that differs by no more from what was told is that.
+    slight: f64,
     range: (f64, f64),
 }
 
-/// An axis of which it is known otherwise than by the error of held-out pixels whether its value differs from what was told.
-struct Known {
-    axis: usize,
-    uncertainty: f64,
-    differs: bool,
-}
-
-/// All axes that the settings ask for, shifts first.
-fn axes(settings: &Calibration) -> Vec<Axis> {
-    let axis = |wanted: bool, name, step, range: RangeInclusive<f64>, get, set| {
-        wanted.then_some(Axis { name, get, set, step, range: (*range.start(), *range.end()) })
+/// All axes that the settings ask for, shifts first. Where neighbours tell nothing, all are told by held-out pixels.
+fn axes(settings: &Calibration, neighbours: bool) -> Vec<Axis> {
+    let axis = |wanted: bool, name, by, [step, slight]: [f64; 2], range: RangeInclusive<f64>, get, set| {
+        let by = if neighbours { by } else { By::HeldOut };
+        wanted.then_some(Axis { name, by, get, set, step, slight, range: (*range.start(), *range.end()) })
     };
-    let (shifts, reach) = (settings.reach > 0.0, -settings.reach..=settings.reach);
+    let (reach, shifts) = (-settings.reach..=settings.reach, settings.reach > 0.0);
+    let (near, held_out, closed) = (By::Neighbours, By::HeldOut, By::Closed);
+    let [moved, turned, scaled, blurred, mixed, faint, dark] =
+        [[0.5, 0.02], [0.1, 0.02], [2e-3, 2e-4], [0.5, 0.2], [0.05, 0.0], [0.05, 0.025], [0.01, 0.025]];
+    #[rustfmt::skip]
     let all = [
-        axis(shifts, "shift down", 0.5, reach.clone(), |p| p.mismatch.shift[0], |p, v| p.mismatch.shift[0] = v),
-        axis(shifts, "shift right", 0.5, reach, |p| p.mismatch.shift[1], |p, v| p.mismatch.shift[1] = v),
-        axis(settings.rotation, "rotation", 0.1, -2.0..=2.0, |p| p.mismatch.rotation, |p, v| p.mismatch.rotation = v),
-        axis(settings.scale, "scale", 2e-3, 0.97..=1.03, |p| p.mismatch.scale, |p, v| p.mismatch.scale = v),
-        axis(settings.clock, "clock", 0.05, -0.5..=0.5, |p| p.mismatch.clock, |p, v| p.mismatch.clock = v),
-        axis(settings.contrast, "contrast", 0.05, 0.3..=1.5, |p| p.mismatch.contrast, |p, v| p.mismatch.contrast = v),
-        axis(settings.black, "black level", 0.01, -0.3..=0.5, |p| p.black, |p, v| p.black = v),
+        axis(shifts, "shift down", near, moved, reach.clone(), |p| p.mismatch.shift[0], |p, v| p.mismatch.shift[0] = v),
+        axis(shifts, "shift right", near, moved, reach, |p| p.mismatch.shift[1], |p, v| p.mismatch.shift[1] = v),
+        axis(settings.rotation, "rotation", near, turned, -2.0..=2.0, |p| p.mismatch.rotation, |p, v| p.mismatch.rotation = v),
+        axis(settings.scale, "scale", near, scaled, 0.97..=1.03, |p| p.mismatch.scale, |p, v| p.mismatch.scale = v),
+        axis(settings.blur && neighbours, "blur", near, blurred, 0.0..=2.0, |p| p.mismatch.blur, |p, v| p.mismatch.blur = v),
+        axis(settings.clock, "clock", held_out, mixed, -0.5..=0.5, |p| p.mismatch.clock, |p, v| p.mismatch.clock = v),
+        axis(settings.contrast, "contrast", closed, faint, 0.3..=1.5, |p| p.mismatch.contrast, |p, v| p.mismatch.contrast = v),
+        axis(settings.black, "black level", closed, dark, -0.3..=0.5, |p| p.black, |p, v| p.black = v),
     ];
     all.into_iter().flatten().collect()
 }
@@ -67,74 +71,94 @@ pub(super) struct Search<'s> {
     watch: &'s mut Watch<'s>,
     axes: Vec<Axis>,
     reach: f64,
+    told: Point,
+    by: By,
     best: Point,
     best_errors: Errors,
-    solves: usize,
+    tried: usize,
     curves: Vec<Vec<(f64, f64)>>,
+    /// One standard deviation of each axis, and whether its value differs from what was told.
+    found: Vec<(f64, bool)>,
 }
 
 impl<'s> Search<'s> {
     pub(super) fn new(judge: Judge<'s>, settings: &Calibration, watch: &'s mut Watch<'s>) -> Self {
-        let axes = axes(settings);
+        let axes = axes(settings, judge.near.is_some());
         let told = Point { mismatch: MaskMismatch::default(), black: 0.0 };
         Self {
             judge,
             watch,
             reach: settings.reach,
             curves: vec![Vec::new(); axes.len()],
+            found: vec![(f64::INFINITY, false); axes.len()],
             axes,
+            told,
+            by: By::HeldOut,
             best: told,
             best_errors: Errors([f64::INFINITY; GROUPS]),
-            solves: 0,
+            tried: 0,
         }
     }
 
     pub(super) fn run(mut self) -> Result<Calibrated, CalibrateError> {
-        let told = self.best;
-        self.best_errors = self.errors(&told)?;
-        let first = self.best_errors.total();
-        self.grid()?;
-        let mut steps: Vec<f64> = self.axes.iter().map(|axis| axis.step).collect();
-        for _ in 0..ROUNDS {
-            for (i, step) in steps.iter_mut().enumerate() {
-                *step = self.descend(i, *step)?;
-            }
-        }
-        let least = self.best_errors.total();
-        let known = self.told_by_closed_pixels(&told)?;
-        if known.is_empty() {
-            self.tell_black_from_contrast(&told, least)?;
-        }
-        let mut uncertainties = (0..self.axes.len()).map(|i| self.uncertainty(i)).collect::<Result<Vec<_>, _>>()?;
-        known.iter().for_each(|known| uncertainties[known.axis] = known.uncertainty);
-        let mut apart = self.leave_as_told(&told, least, &uncertainties, &known)?;
-        if !known.is_empty() {
-            // Masks may sit elsewhere now.
-            for known in self.told_by_closed_pixels(&told)? {
-                (apart[known.axis], uncertainties[known.axis]) = (known.differs, known.uncertainty);
-            }
-        }
-        let parameters = self.parameters(&uncertainties, &apart);
+        let first = self.judge.held_out(&self.told)?.total();
+        self.search(By::Neighbours)?;
+        self.level()?;
+        self.search(By::HeldOut)?;
+        let parameters = self.parameters();
         Ok(Calibrated {
             mismatch: self.best.mismatch,
             black: self.best.black * self.judge.level,
             exposure: None,
-            error: [first, self.best_errors.total()],
+            error: [first, self.judge.held_out(&self.best)?.total()],
             parameters,
-            solves: self.solves,
+            solves: self.tried,
         })
+    }
+
+    /// The axes that are told by this.
+    fn axes_by(&self, by: By) -> Vec<usize> {
+        (0..self.axes.len()).filter(|&axis| self.axes[axis].by == by).collect()
+    }
+
+    /// Looks for all that is told by one of the two errors.
+    fn search(&mut self, by: By) -> Result<(), CalibrateError> {
+        let axes = self.axes_by(by);
+        if axes.is_empty() {
+            return Ok(());
+        }
+        self.by = by;
+        let point = self.best;
+        self.best_errors = self.errors(&point)?;
+        if axes.iter().any(|&axis| self.axes[axis].name.starts_with("shift")) {
+            self.grid()?;
+        }
+        let mut steps: Vec<f64> = axes.iter().map(|&axis| self.axes[axis].step).collect();
+        for _ in 0..ROUNDS {
+            for (&axis, step) in axes.iter().zip(&mut steps) {
+                *step = self.descend(axis, *step)?;
+            }
+        }
+        for &axis in &axes {
+            self.found[axis].0 = self.uncertainty(axis)?;
+        }
+        self.leave_as_told(&axes)
     }
 
     fn expected(&self) -> usize {
         let side = 2 * self.reach.floor() as usize + 1;
-        side * side + (3 * ROUNDS + 3 + self.axes.len() / 2) * self.axes.len() + 2 * (1 + 3 * ALONE)
+        let moving = self.axes.iter().filter(|axis| axis.by != By::Closed).count();
+        side * side + (3 * ROUNDS + 3 + moving / 2) * moving
     }
 
     fn errors(&mut self, point: &Point) -> Result<Errors, CalibrateError> {
-        let errors = self.judge.errors(point)?;
-        self.solves += 1;
+        let errors = match &self.judge.near {
+            Some(near) if self.by == By::Neighbours => near.errors(self.judge.open(point)?.view()),
+            _ => self.judge.held_out(point)?,
+        };
+        self.tried += 1;
         let error = self.best_errors.total().min(errors.total());
-        let progress = Progress { solves: self.solves, expected: self.expected().max(self.solves), error };
+        let progress = Progress { solves: self.tried, expected: self.expected().max(self.tried), error };
         match (self.watch)(progress) {
             std::ops::ControlFlow::Continue(()) => Ok(errors),
             std::ops::ControlFlow::Break(()) => Err(CalibrateError::Stopped),
@@ -220,115 +244,63 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
-    /// Black level and contrast as nearly closed pixels tell them, if they do, of masks as found, or as told where that is far surer: TV gains from
-    /// masks that moved by some hundredths of a pixel with the scene, and their closed pixels are others. What is known then.
-    fn told_by_closed_pixels(&mut self, told: &Point) -> Result<Vec<Known>, CalibrateError> {
-        if self.named("black level").or(self.named("contrast")).is_none() {
-            return Ok(Vec::new());
-        }
-        let doubt = |level: &Level| level.uncertainty.iter().sum::<f64>();
-        let level = match (self.judge.level(told)?, self.judge.level(&self.best)?) {
-            (Some(as_told), Some(found)) if SURER * doubt(&as_told) > doubt(&found) => found,
-            (Some(level), _) | (None, Some(level)) => level,
-            (None, None) => return Ok(Vec::new()),
-        };
-        let sure = level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
-        if !sure || (level.contrast - 1.0).abs() > LIKE {
-            return Ok(Vec::new());
-        }
-        let mut known = Vec::new();
-        for (name, value, uncertainty) in [
-            ("black level", level.black.max(0.0), level.uncertainty[0]),
-            ("contrast", level.contrast, level.uncertainty[1]),
-        ] {
-            let Some(axis) = self.named(name) else { continue };
-            let as_told = (self.axes[axis].get)(told);
-            let differs = (value - as_told).abs() > SLIGHT.max(CLEAR * uncertainty);
-            self.best = self.with(axis, if differs { value } else { as_told });
-            known.push(Known { axis, uncertainty, differs });
-        }
-        let point = self.best;
-        self.best_errors = self.errors(&point)?;
-        Ok(known)
-    }
-
-    fn named(&self, name: &str) -> Option<usize> {
-        self.axes.iter().position(|axis| axis.name == name)
-    }
-
-    /// A black level and less contrast both are light that no mask explains, and a descent by one after the other ends with some of each. Where one
-    /// alone, at its own best, is nearly as good, the better of the two is what is there.
-    fn tell_black_from_contrast(&mut self, told: &Point, least: f64) -> Result<(), CalibrateError> {
-        let (Some(contrast), Some(black)) = (self.named("contrast"), self.named("black level")) else { return Ok(()) };
-        let (black_alone, contrast_alone) = (self.alone(black, contrast, told)?, self.alone(contrast, black, told)?);
-        let better = if black_alone.1.total() < contrast_alone.1.total() { black_alone } else { contrast_alone };
-        if better.1.total() <= (1.0 + WORTH) * least {
-            (self.best, self.best_errors) = better;
+    /// Black level and contrast as nearly closed pixels tell them, or, where these are too few, all.
+    fn level(&mut self) -> Result<(), CalibrateError> {
+        let (axes, point) = (self.axes_by(By::Closed), self.best);
+        let (false, Some(near)) = (axes.is_empty(), &self.judge.near) else { return Ok(()) };
+        let open = self.judge.open(&point)?;
+        let like = |level: &Level| (level.contrast - 1.0).abs() <= LIKE;
+        let sure = |level: &Level| level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
+        let closed = near.level(open.view()).filter(|level| sure(level) && like(level));
+        let Some(level) = closed.or_else(|| near.level_by_all(open.view())) else { return Ok(()) };
+        for axis in axes {
+            let Axis { name, get, .. } = self.axes[axis];
+            let (value, uncertainty) = match name {
+                "contrast" => (level.contrast, level.uncertainty[1]),
+                _ => (level.black.max(0.0), level.uncertainty[0]),
+            };
+            let apart = self.differs(axis, value, uncertainty);
+            self.found[axis] = (uncertainty, apart);
+            self.best = self.with(axis, if apart { value } else { get(&self.told) });
         }
         Ok(())
     }
 
-    /// The best value of an axis with another as told, from where the search is.
-    fn alone(&mut self, axis: usize, other: usize, told: &Point) -> Result<(Point, Errors), CalibrateError> {
-        let here = (self.best, self.best_errors);
-        let point = self.with(other, (self.axes[other].get)(told));
-        (self.best, self.best_errors) = (point, self.errors(&point)?);
-        self.descend_alone(axis)?;
-        let found = (self.best, self.best_errors);
-        (self.best, self.best_errors) = here;
-        Ok(found)
+    /// Whether a value differs from what was told.
+    fn differs(&self, axis: usize, value: f64, uncertainty: f64) -> bool {
+        let Axis { get, slight, .. } = self.axes[axis];
+        (value - get(&self.told)).abs() > slight.max(APART * uncertainty)
     }
 
-    /// To the best value of an axis that has shared with another what there is, so that it is far.
-    fn descend_alone(&mut self, axis: usize) -> Result<(), CalibrateError> {
-        let mut step = 4.0 * self.axes[axis].step;
-        for _ in 0..ALONE {
-            step = self.descend(axis, step)?;
-        }
-        Ok(())
-    }
-
-    /// Puts parameters back to what was told, but for those that are `known`, the one that costs least first: those that do not differ from it
-    /// by more than the data leave open, then all without which the error stays near the least. Which are left.
-    fn leave_as_told(
-        &mut self,
-        told: &Point,
-        least: f64,
-        uncertainties: &[f64],
-        known: &[Known],
-    ) -> Result<Vec<bool>, CalibrateError> {
-        let differs = |(axis, uncertainty): (&Axis, &f64)| {
-            ((axis.get)(&self.best) - (axis.get)(told)).abs() > APART * uncertainty
-        };
-        let mut apart: Vec<bool> = self.axes.iter().zip(uncertainties).map(differs).collect();
-        known.iter().for_each(|known| apart[known.axis] = known.differs);
-        let mut point = self.best;
-        for (axis, _) in self.axes.iter().zip(&apart).filter(|(_, apart)| !**apart) {
-            (axis.set)(&mut point, (axis.get)(told));
+    /// Puts parameters back to what was told, the one that costs least first: those that do not differ from it by more than the data leave open,
+    /// then, by held-out pixels, all without which the error stays near the least.
+    fn leave_as_told(&mut self, axes: &[usize]) -> Result<(), CalibrateError> {
+        let (least, mut point) = (self.best_errors.total(), self.best);
+        for &axis in axes {
+            let Axis { get, set, .. } = self.axes[axis];
+            self.found[axis].1 = self.differs(axis, get(&self.best), self.found[axis].0);
+            if !self.found[axis].1 {
+                set(&mut point, get(&self.told));
+            }
         }
         if point != self.best {
             (self.best, self.best_errors) = (point, self.errors(&point)?);
         }
-        while let Some((axis, point, errors)) = self.cheapest(told, &apart, known)? {
+        while let (By::HeldOut, Some((axis, point, errors))) = (self.by, self.cheapest(axes)?) {
             if errors.total() > (1.0 + WORTH) * least {
                 break;
             }
-            apart[axis] = false;
+            self.found[axis].1 = false;
             (self.best, self.best_errors) = (point, errors);
         }
-        Ok(apart)
+        Ok(())
     }
 
     /// Of the parameters that are apart the one whose return to what was told costs least, with the point and its errors.
-    fn cheapest(
-        &mut self,
-        told: &Point,
-        apart: &[bool],
-        known: &[Known],
-    ) -> Result<Option<(usize, Point, Errors)>, CalibrateError> {
+    fn cheapest(&mut self, axes: &[usize]) -> Result<Option<(usize, Point, Errors)>, CalibrateError> {
         let mut cheapest: Option<(usize, Point, Errors)> = None;
-        for axis in (0..apart.len()).filter(|&axis| apart[axis] && known.iter().all(|known| known.axis != axis)) {
-            let point = self.with(axis, (self.axes[axis].get)(told));
+        for &axis in axes.iter().filter(|&&axis| self.found[axis].1).collect::<Vec<_>>() {
+            let point = self.with(axis, (self.axes[axis].get)(&self.told));
             let errors = self.errors(&point)?;
             if cheapest.is_none_or(|(_, _, least)| errors.total() < least.total()) {
                 cheapest = Some((axis, point, errors));
@@ -337,10 +309,10 @@ impl<'s> Search<'s> {
         Ok(cheapest)
     }
 
-    fn parameters(&mut self, uncertainties: &[f64], apart: &[bool]) -> Vec<Parameter> {
+    fn parameters(&mut self) -> Vec<Parameter> {
         let curves = std::mem::take(&mut self.curves);
-        let all = self.axes.iter().zip(uncertainties).zip(apart).zip(curves);
-        all.map(|(((axis, &uncertainty), &told_apart), mut curve)| {
+        let all = self.axes.iter().zip(&self.found).zip(curves);
+        all.map(|((axis, &(uncertainty, told_apart)), mut curve)| {
             curve.sort_by(|a, b| a.0.total_cmp(&b.0));
             Parameter { name: axis.name, value: (axis.get)(&self.best), uncertainty, told_apart, curve }
         })

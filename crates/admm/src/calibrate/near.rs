@@ -1,0 +1,198 @@
+//! How masks sit, by how well they explain each pixel from the brightness around it.
+//!
+//! With S = Σ_t C_t, S̄ its mean around a pixel, ȳ that of y, contrast c and black level b,
+//!
+//! ```text
+//! y = ȳ S/S̄ + (1 − S/S̄)((1 − c) ȳ + c b) + texture of the scene
+//! ```
+//!
+//! What is left beside ȳ is least where S is of the masks that are there. The scene's texture does not follow masks that move over it, so that it
+//! adds to the error and leaves the minimum where it is; no video is solved. The contrast and the black level are fitted to all pixels at once.
+
+use super::level::{self, Level};
+use super::{Errors, GROUPS, tile_of};
+use ndarray::{Array2, ArrayView2, Zip, s};
+use rayon::prelude::*;
+use sci_forward::{CfaPattern, MaskStack, brightness};
+
+/// Pixels to each side that tell how bright it is around one.
+pub(super) const RADIUS: usize = 4;
+/// How far pixels are off, of their brightness: what masks and noise leave, and texture, by how much is open.
+const APART: f64 = 0.3;
+const TEXTURE: f64 = 0.3;
+/// The share of pixels around one that must be believed.
+const MOST: f32 = 0.5;
+/// Times that, beyond which errors count by their size instead of its square.
+const FAR: f64 = 3.0;
+/// One standard deviation of the black level and the contrast that all pixels tell.
+const BY_ALL: f64 = 0.025;
+/// Pixels without which nothing is told.
+const LEAST: usize = 64;
+
+/// One measurement, or one color of it, with the brightness around each pixel, in units of the mean of |y|.
+struct View {
+    y: Array2<f32>,
+    light: Array2<f32>,
+    /// 1 where a pixel is believed, and how many are around it, with it.
+    believed: Array2<f32>,
+    count: Array2<f32>,
+    usable: Array2<bool>,
+    groups: Array2<u8>,
+    offset: (usize, usize),
+}
+
+/// A pixel: how open it is by what is around it, its light and that around it.
+pub(super) struct Pixel {
+    pub(super) tile: usize,
+    group: usize,
+    /// S over the usual S.
+    pub(super) share: f64,
+    /// S/S̄.
+    pub(super) open: f64,
+    pub(super) y: f64,
+    pub(super) light: f64,
+}
+
+impl Pixel {
+    /// One over the square of how far it may be off.
+    fn weight(&self) -> f64 {
+        1.0 / (APART.powi(2) + (TEXTURE * self.open).powi(2))
+    }
+
+    /// How far it is from ȳ S/S̄, and what 1 − c and b c would add to that, by the brightness around.
+    pub(super) fn off(&self) -> (f64, [f64; 2]) {
+        let closed = 1.0 - self.open;
+        ((self.y - self.open * self.light) / self.light, [closed, closed / self.light])
+    }
+}
+
+/// What is asked.
+pub(super) struct Neighbours {
+    views: Vec<View>,
+    /// Pixels of a color between one and the next.
+    each: usize,
+}
+
+impl Neighbours {
+    /// Of measurements with the mean of |y|. Pixels that are not `believed` are not asked, nor those among many such, or within `margin` of the edge.
+    /// Nothing for masks of both signs, whose sum does not tell how bright it is, or where next to nothing is left.
+    pub(super) fn new(
+        masks: &MaskStack,
+        cfa: Option<CfaPattern>,
+        (measurements, mean): (&[Array2<f32>], f64),
+        believed: &[Array2<bool>],
+        groups: &Array2<u8>,
+        margin: usize,
+    ) -> Option<Self> {
+        if mean <= 0.0 || masks.view().iter().any(|&c| c < 0.0) {
+            return None;
+        }
+        // Each color has a brightness of its own.
+        let each = if cfa.is_some() { 2 } else { 1 };
+        let mut views = Vec::new();
+        for (y, believed) in measurements.iter().zip(believed) {
+            for offset in (0..each).flat_map(|row| (0..each).map(move |column| (row, column))) {
+                let of = s![offset.0..;each, offset.1..;each];
+                let y = y.slice(of).mapv(|y| y / mean as f32);
+                let believed = believed.slice(of).mapv(f32::from);
+                let count = counts(&believed);
+                let mut usable = Zip::from(&believed).and(&count).map_collect(|&own, &n| own > 0.0 && n > MOST * COUNT);
+                let (height, width) = usable.dim();
+                let inside = |at: usize, size: usize| (margin..size.saturating_sub(margin)).contains(&at);
+                usable.indexed_iter_mut().for_each(|((i, j), u)| *u &= inside(i, height) && inside(j, width));
+                let groups = groups.slice(of).to_owned();
+                let mut view = View { light: Array2::zeros(y.dim()), y, believed, count, usable, groups, offset };
+                view.light = view.around(view.y.view());
+                views.push(view);
+            }
+        }
+        let near = Self { views, each };
+        (near.pixels(masks.sum().view()).len() >= LEAST).then_some(near)
+    }
+
+    /// All pixels that are asked, of masks with this sum.
+    fn pixels(&self, open: ArrayView2<'_, f32>) -> Vec<Pixel> {
+        let of_view = |view: &View| {
+            let open = open.slice(s![view.offset.0..;self.each, view.offset.1..;self.each]);
+            let (open_near, usual) = (view.around(open), f64::from(open.mean().unwrap_or(0.0)));
+            let mut pixels = Vec::with_capacity(open.len());
+            for (at, _) in view.usable.indexed_iter().filter(|(_, usable)| **usable) {
+                let (light, near) = (f64::from(view.light[at]), f64::from(open_near[at]));
+                // In the dark nothing is told, and noise would be divided by little.
+                if near < 0.2 * usual || light < 0.05 {
+                    continue;
+                }
+                let open = f64::from(open[at]);
+                pixels.push(Pixel {
+                    tile: tile_of(at, view.usable.dim()),
+                    group: usize::from(view.groups[at]),
+                    share: open / usual,
+                    open: open / near,
+                    y: f64::from(view.y[at]),
+                    light,
+                });
+            }
+            pixels
+        };
+        self.views.par_iter().flat_map_iter(of_view).collect()
+    }
+
+    /// What is left of the pixels' light beside that around them, shared out among the groups: 1 is as far as is usual.
+    pub(super) fn errors(&self, open: ArrayView2<'_, f32>) -> Errors {
+        let pixels = self.pixels(open);
+        let found = fitted(&pixels).unwrap_or([0.0; 2]);
+        let mut errors = [0.0; GROUPS];
+        for p in &pixels {
+            let (off, by) = p.off();
+            let left = (off - by[0] * found[0] - by[1] * found[1]).abs() * p.weight().sqrt();
+            let error = if left < FAR { left * left } else { FAR * (2.0 * left - FAR) };
+            errors[p.group] += error / pixels.len().max(1) as f64;
+        }
+        Errors(errors)
+    }
+
+    /// Black level and contrast, by nearly closed pixels.
+    pub(super) fn level(&self, open: ArrayView2<'_, f32>) -> Option<Level> {
+        level::fit(&self.pixels(open))
+    }
+
+    /// Black level and contrast, by all pixels; what is dark among bright seems less so, so that neither is sure to some hundredths.
+    pub(super) fn level_by_all(&self, open: ArrayView2<'_, f32>) -> Option<Level> {
+        let [closed, black] = fitted(&self.pixels(open))?;
+        let contrast = (1.0 - closed).min(1.0);
+        (contrast > 0.0).then_some(Level { black: black / contrast, contrast, uncertainty: [BY_ALL; 2] })
+    }
+}
+
+/// Pixels of a whole square.
+const COUNT: f32 = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
+
+/// How many pixels of the square around each are believed, where it is inside.
+fn counts(believed: &Array2<f32>) -> Array2<f32> {
+    COUNT * brightness(believed.view(), Array2::ones(believed.dim()).view(), RADIUS)
+}
+
+impl View {
+    /// The mean of the believed pixels around each, without it.
+    fn around(&self, image: ArrayView2<'_, f32>) -> Array2<f32> {
+        let mut mean = brightness(image, self.believed.view(), RADIUS);
+        Zip::from(&mut mean).and(&image).and(&self.believed).and(&self.count).for_each(
+            |mean, &own, &believed, &count| {
+                *mean = (count * *mean - believed * own) / (count - believed).max(1.0);
+            },
+        );
+        mean
+    }
+}
+
+/// 1 − c and b c by weighted least squares.
+fn fitted(pixels: &[Pixel]) -> Option<[f64; 2]> {
+    let (mut normal, mut right) = ([0.0; 3], [0.0; 2]);
+    for p in pixels {
+        let (off, [a, b]) = p.off();
+        let weight = p.weight();
+        normal = [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b];
+        right = [right[0] + weight * a * off, right[1] + weight * b * off];
+    }
+    level::solve(normal, right)
+}
