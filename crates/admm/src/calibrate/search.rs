@@ -50,7 +50,7 @@ fn axes(settings: &Calibration, neighbours: bool) -> Vec<Axis> {
     let (reach, shifts) = (-settings.reach..=settings.reach, settings.reach > 0.0);
     let (near, held_out, closed) = (By::Neighbours, By::HeldOut, By::Closed);
     let [moved, turned, scaled, blurred, mixed, faint, dark] =
-        [[0.5, 0.02], [0.1, 0.02], [2e-3, 2e-4], [0.5, 0.2], [0.05, 0.0], [0.05, 0.025], [0.01, 0.025]];
+        [[0.5, 0.02], [0.1, 0.02], [2e-3, 2e-4], [0.5, 0.3], [0.05, 0.0], [0.05, 0.01], [0.01, 0.01]];
     #[rustfmt::skip]
     let all = [
         axis(shifts, "shift down", near, moved, reach.clone(), |p| p.mismatch.shift[0], |p, v| p.mismatch.shift[0] = v),
@@ -244,7 +244,8 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
-    /// Black level and contrast as nearly closed pixels tell them, or, where these are too few, all.
+    /// Black level and contrast as nearly closed pixels tell them, or, where these are too few, all. A scene may imitate some of either: held-out pixels
+    /// must be predicted better with them.
     fn level(&mut self) -> Result<(), CalibrateError> {
         let (axes, point) = (self.axes_by(By::Closed), self.best);
         let (false, Some(near)) = (axes.is_empty(), &self.judge.near) else { return Ok(()) };
@@ -253,15 +254,20 @@ impl<'s> Search<'s> {
         let sure = |level: &Level| level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
         let closed = near.level(open.view()).filter(|level| sure(level) && like(level));
         let Some(level) = closed.or_else(|| near.level_by_all(open.view())) else { return Ok(()) };
-        for axis in axes {
-            let Axis { name, get, .. } = self.axes[axis];
+        for &axis in &axes {
+            let Axis { name, .. } = self.axes[axis];
             let (value, uncertainty) = match name {
                 "contrast" => (level.contrast, level.uncertainty[1]),
                 _ => (level.black.max(0.0), level.uncertainty[0]),
             };
-            let apart = self.differs(axis, value, uncertainty);
-            self.found[axis] = (uncertainty, apart);
-            self.best = self.with(axis, if apart { value } else { get(&self.told) });
+            self.found[axis] = (uncertainty, self.differs(axis, value, uncertainty));
+            if self.found[axis].1 {
+                self.best = self.with(axis, value);
+            }
+        }
+        if self.best != point && self.judge.held_out(&self.best)?.total() > self.judge.held_out(&point)?.total() {
+            self.best = point;
+            axes.iter().for_each(|&axis| self.found[axis].1 = false);
         }
         Ok(())
     }
