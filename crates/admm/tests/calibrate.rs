@@ -1,7 +1,7 @@
 //! Masks that sit elsewhere than they were told to, found from measurements alone.
 
 use admm::sci_forward::testing::moving_square;
-use admm::sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
+use admm::sci_forward::{CfaPattern, MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
 use admm::{CalibrateError, Calibrated, Calibration};
 use ndarray::{Array2, Array3};
 use std::ops::ControlFlow;
@@ -52,6 +52,44 @@ fn a_shift_of_any_sign_is_found_in_every_scene() {
         }
         assert!(found.error[1] < 0.5 * found.error[0], "{:?}", found.error);
         assert!(found.parameters.iter().all(|p| p.told_apart), "{:?}", found.parameters);
+    }
+}
+
+#[test]
+fn a_blur_is_told_from_a_shift() {
+    let truth = &scenes()[1];
+    let both = Calibration { blur: true, ..shifts() };
+    for (shift, blur) in [([0.0, 0.0], 0.6), ([0.5, -0.3], 0.0), ([0.25, 0.0], 0.5)] {
+        let found = find(&both, measured(truth, &MaskMismatch { shift, blur, ..MaskMismatch::default() }));
+        assert!((found.mismatch.blur - blur).abs() < 0.1, "{shift:?}, {blur}: {:?}", found.mismatch);
+        let off = (0..2).map(|axis| (found.mismatch.shift[axis] - shift[axis]).abs()).fold(0.0, f64::max);
+        assert!(off < 0.06, "{shift:?}, {blur}: {:?}", found.mismatch);
+    }
+}
+
+/// Their sum does not tell how bright it is, so that pixels are held out.
+#[test]
+fn a_shift_of_masks_of_both_signs_is_found() {
+    let told = told().differential();
+    let real = MaskMismatch { shift: [0.5, -0.3], ..MaskMismatch::default() }.apply(&told).unwrap();
+    let y = MaskOperator::new(real).forward(scenes()[0].view());
+    let found = shifts().find(&told, None, &[y], &mut |_| ControlFlow::Continue(())).unwrap();
+    let [down, right] = found.mismatch.shift;
+    assert!((down - 0.5).abs() < 0.1 && (right + 0.3).abs() < 0.1, "{found:?}");
+}
+
+/// Where no neighbours tell anything, and where few do.
+#[test]
+fn small_sensors_are_no_trouble() {
+    for size in [9, 14, 20] {
+        let shape = VideoShape { frames: 2, height: size, width: size + 1 };
+        let masks = MaskStack::random(shape, 0.5, 1).unwrap();
+        let y = MaskOperator::new(masks.clone()).forward(moving_square(shape).view());
+        for cfa in [None, Some(CfaPattern::Rggb)] {
+            let found = Calibration::default().find(&masks, cfa, &[y.clone()], &mut |_| ControlFlow::Continue(()));
+            let found = found.unwrap();
+            assert!(found.error[1] <= found.error[0], "{size}, {cfa:?}: {found:?}");
+        }
     }
 }
 

@@ -55,7 +55,7 @@ pub struct Calibration {
     pub error_after: f64,
     /// All that was looked for.
     pub parameters: Vec<Parameter>,
-    /// Solves that it took.
+    /// Mismatches that were tried.
     pub solves: usize,
 }
 

@@ -14,8 +14,8 @@ use crate::operator::pattern;
 use crate::pool;
 use crate::reconstruct::say;
 
-/// Finds how the masks really sit, from measurements alone, as `sci calibrate` does: pixels are held out, and what predicts them best is
-/// taken.
+/// Finds how the masks really sit, from measurements alone, as `sci calibrate` does: what explains each pixel best from the brightness around it
+/// is taken.
 ///
 /// Parameters
 /// ----------

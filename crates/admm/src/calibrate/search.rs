@@ -105,12 +105,18 @@ impl<'s> Search<'s> {
         self.search(By::Neighbours)?;
         self.level()?;
         self.search(By::HeldOut)?;
+        let mut last = self.judge.held_out(&self.best)?.total();
+        // What predicts no better is not what is there.
+        if last > first {
+            (self.best, last) = (self.told, first);
+            self.found.iter_mut().for_each(|found| found.1 = false);
+        }
         let parameters = self.parameters();
         Ok(Calibrated {
             mismatch: self.best.mismatch,
             black: self.best.black * self.judge.level,
             exposure: None,
-            error: [first, self.judge.held_out(&self.best)?.total()],
+            error: [first, last],
             parameters,
             solves: self.tried,
         })

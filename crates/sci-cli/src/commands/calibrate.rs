@@ -67,7 +67,7 @@ impl Args {
         found.apply(&mut scene)?;
         scene.look_for_defects(experiment.data.reading.defects)?.iter().for_each(|note| say(&experiment, note));
         let Calibration { error_before, error_after, solves, .. } = found;
-        outln!("held-out error {error_before:.3e} -> {error_after:.3e} after {solves} solves");
+        outln!("held-out error {error_before:.3e} -> {error_after:.3e} after {solves} tries");
         outln!("wrote {0}; use it by --set data.calibration={0}/calibration.json", out.display());
         Ok(Done::Complete)
     }
