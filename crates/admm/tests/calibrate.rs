@@ -86,7 +86,8 @@ fn small_sensors_are_no_trouble() {
         let masks = MaskStack::random(shape, 0.5, 1).unwrap();
         let y = MaskOperator::new(masks.clone()).forward(moving_square(shape).view());
         for cfa in [None, Some(CfaPattern::Rggb)] {
-            let found = Calibration::default().find(&masks, cfa, &[y.clone()], &mut |_| ControlFlow::Continue(()));
+            let found =
+                Calibration::default().find(&masks, cfa, std::slice::from_ref(&y), &mut |_| ControlFlow::Continue(()));
             let found = found.unwrap();
             assert!(found.error[1] <= found.error[0], "{size}, {cfa:?}: {found:?}");
         }

@@ -1,4 +1,4 @@
-//! ShiftNet: a video denoiser of ours for many calls at little cost, a tenth of FastDVDnet's: a small U-shaped network for whole clips, frames
+//! ShiftNet: a video denoiser of ours for many calls at little cost, a sixth of FastDVDnet's: a small U-shaped network for whole clips, frames
 //! mixed by shifts in time, told σ by a constant map.
 //!
 //! ```text
