@@ -10,8 +10,6 @@
 //! same everywhere. There the scene's own texture is as little open, so that those pixels, few as they are, tell the two apart; how far pixels
 //! are off, by how much is open, is learned from themselves. The error of held-out pixels does not tell: TV itself gains from some.
 
-use super::near::Pixel;
-
 /// Shares of the usual S between which pixels are as far off as one another.
 const STEPS: [f64; 7] = [0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.2];
 /// Pixels of a step that tell how far it is off; with fewer it is as far as the next.
@@ -22,6 +20,26 @@ const ROUNDS: usize = 4;
 const OUTLIER: f64 = 3.0;
 /// The median of a normal variable's square, of variance 1.
 const MEDIAN_SQUARE: f64 = 0.455;
+
+/// A pixel: how open it is by what is around it, its light and that around it.
+pub(super) struct Pixel {
+    pub(super) tile: usize,
+    pub(super) group: usize,
+    /// S over the usual S.
+    pub(super) share: f64,
+    /// S/S̄.
+    pub(super) open: f64,
+    pub(super) y: f64,
+    pub(super) light: f64,
+}
+
+impl Pixel {
+    /// How far it is from ȳ S/S̄, and what 1 − c and b c would add to that, by the brightness around.
+    pub(super) fn off(&self) -> (f64, [f64; 2]) {
+        let closed = 1.0 - self.open;
+        ((self.y - self.open * self.light) / self.light, [closed, closed / self.light])
+    }
+}
 
 /// What is found.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -104,51 +122,4 @@ pub(super) fn solve([a, b, c]: [f64; 3], right: [f64; 2]) -> Option<[f64; 2]> {
     let determinant = a * c - b * b;
     (determinant > 1e-9 * a * c)
         .then(|| [(c * right[0] - b * right[1]) / determinant, (a * right[1] - b * right[0]) / determinant])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::near::Neighbours;
-    use super::*;
-    use ndarray::Array3;
-    use sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
-
-    const SHAPE: VideoShape = VideoShape { frames: 6, height: 96, width: 96 };
-
-    /// Texture on a slow change of brightness, moving.
-    fn scene() -> Array3<f32> {
-        Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| {
-            let slow = 0.4 + 0.3 * (0.05 * i as f32 + 0.04 * (j + t) as f32).sin();
-            slow * (1.0 + 0.2 * (1.9 * i as f32 + 0.7 * t as f32).sin() * (2.3 * j as f32).cos())
-        })
-    }
-
-    fn found(masks: &MaskStack, contrast: f64, black: f32) -> Option<(Level, f64)> {
-        let real = MaskMismatch { contrast, ..MaskMismatch::default() }.apply(masks).unwrap();
-        let y = MaskOperator::new(real).forward(scene().view()) + black;
-        let mean = f64::from(y.mean().unwrap());
-        let (believed, groups) = (y.mapv(|_| true), y.mapv(|_| 0));
-        let near = Neighbours::new(masks, None, (&[y], mean), &[believed], &groups, 4)?;
-        near.level(masks.sum().view()).map(|level| (level, f64::from(black) / mean))
-    }
-
-    #[test]
-    fn a_black_level_and_less_contrast_are_told_apart() {
-        for masks in [MaskStack::random(SHAPE, 0.5, 3).unwrap(), MaskStack::shifting(SHAPE, 0.5, 3).unwrap()] {
-            for (contrast, black) in [(1.0, 0.0), (1.0, 0.2), (0.9, 0.0), (0.95, 0.1)] {
-                let (level, real) = found(&masks, contrast, black).unwrap();
-                let off = (level.black - real).abs();
-                assert!(off < 0.02 && off < 4.0 * level.uncertainty[0].max(2e-3), "{contrast}, {real}: {level:?}");
-                assert!((level.contrast - contrast).abs() < 0.03, "{contrast}: {level:?}");
-            }
-        }
-    }
-
-    #[test]
-    fn masks_that_let_everything_through_and_those_of_both_signs_tell_nothing() {
-        let open = MaskStack::new(Array3::from_elem(SHAPE.dim(), 1.0)).unwrap();
-        assert_eq!(found(&open, 1.0, 0.2), None);
-        let signed = MaskStack::random(SHAPE, 0.5, 3).unwrap().view().mapv(|c| 2.0 * c - 1.0);
-        assert_eq!(found(&MaskStack::new(signed).unwrap(), 1.0, 0.2), None);
-    }
 }

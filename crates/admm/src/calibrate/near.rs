@@ -9,7 +9,7 @@
 //! What is left beside ȳ is least where S is of the masks that are there. The scene's texture does not follow masks that move over it, so that it
 //! adds to the error and leaves the minimum where it is; no video is solved. The contrast and the black level are fitted to all pixels at once.
 
-use super::level::{self, Level};
+use super::level::{self, Level, Pixel};
 use super::{Errors, GROUPS, tile_of};
 use ndarray::{Array2, ArrayView2, Zip, s};
 use rayon::prelude::*;
@@ -39,31 +39,6 @@ struct View {
     usable: Array2<bool>,
     groups: Array2<u8>,
     offset: (usize, usize),
-}
-
-/// A pixel: how open it is by what is around it, its light and that around it.
-pub(super) struct Pixel {
-    pub(super) tile: usize,
-    group: usize,
-    /// S over the usual S.
-    pub(super) share: f64,
-    /// S/S̄.
-    pub(super) open: f64,
-    pub(super) y: f64,
-    pub(super) light: f64,
-}
-
-impl Pixel {
-    /// One over the square of how far it may be off.
-    fn weight(&self) -> f64 {
-        1.0 / (APART.powi(2) + (TEXTURE * self.open).powi(2))
-    }
-
-    /// How far it is from ȳ S/S̄, and what 1 − c and b c would add to that, by the brightness around.
-    pub(super) fn off(&self) -> (f64, [f64; 2]) {
-        let closed = 1.0 - self.open;
-        ((self.y - self.open * self.light) / self.light, [closed, closed / self.light])
-    }
 }
 
 /// What is asked.
@@ -144,7 +119,7 @@ impl Neighbours {
         let mut errors = [0.0; GROUPS];
         for p in &pixels {
             let (off, by) = p.off();
-            let left = (off - by[0] * found[0] - by[1] * found[1]).abs() * p.weight().sqrt();
+            let left = (off - by[0] * found[0] - by[1] * found[1]).abs() * weight(p).sqrt();
             let error = if left < FAR { left * left } else { FAR * (2.0 * left - FAR) };
             errors[p.group] += error / pixels.len().max(1) as f64;
         }
@@ -185,14 +160,65 @@ impl View {
     }
 }
 
+/// One over the square of how far a pixel may be off.
+fn weight(p: &Pixel) -> f64 {
+    1.0 / (APART.powi(2) + (TEXTURE * p.open).powi(2))
+}
+
 /// 1 − c and b c by weighted least squares.
 fn fitted(pixels: &[Pixel]) -> Option<[f64; 2]> {
     let (mut normal, mut right) = ([0.0; 3], [0.0; 2]);
     for p in pixels {
         let (off, [a, b]) = p.off();
-        let weight = p.weight();
+        let weight = weight(p);
         normal = [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b];
         right = [right[0] + weight * a * off, right[1] + weight * b * off];
     }
     level::solve(normal, right)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array3;
+    use sci_forward::{MaskMismatch, MaskOperator, MaskStack, SensingOperator, VideoShape};
+
+    const SHAPE: VideoShape = VideoShape { frames: 6, height: 96, width: 96 };
+
+    /// Texture on a slow change of brightness, moving.
+    fn scene() -> Array3<f32> {
+        Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| {
+            let slow = 0.4 + 0.3 * (0.05 * i as f32 + 0.04 * (j + t) as f32).sin();
+            slow * (1.0 + 0.2 * (1.9 * i as f32 + 0.7 * t as f32).sin() * (2.3 * j as f32).cos())
+        })
+    }
+
+    fn found(masks: &MaskStack, contrast: f64, black: f32) -> Option<(Level, f64)> {
+        let real = MaskMismatch { contrast, ..MaskMismatch::default() }.apply(masks).unwrap();
+        let y = MaskOperator::new(real).forward(scene().view()) + black;
+        let mean = f64::from(y.mean().unwrap());
+        let (believed, groups) = (y.mapv(|_| true), y.mapv(|_| 0));
+        let near = Neighbours::new(masks, None, (&[y], mean), &[believed], &groups, 4)?;
+        near.level(masks.sum().view()).map(|level| (level, f64::from(black) / mean))
+    }
+
+    #[test]
+    fn a_black_level_and_less_contrast_are_told_apart() {
+        for masks in [MaskStack::random(SHAPE, 0.5, 3).unwrap(), MaskStack::shifting(SHAPE, 0.5, 3).unwrap()] {
+            for (contrast, black) in [(1.0, 0.0), (1.0, 0.2), (0.9, 0.0), (0.95, 0.1)] {
+                let (level, real) = found(&masks, contrast, black).unwrap();
+                let off = (level.black - real).abs();
+                assert!(off < 0.02 && off < 4.0 * level.uncertainty[0].max(2e-3), "{contrast}, {real}: {level:?}");
+                assert!((level.contrast - contrast).abs() < 0.03, "{contrast}: {level:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn masks_that_let_everything_through_and_those_of_both_signs_tell_nothing() {
+        let open = MaskStack::new(Array3::from_elem(SHAPE.dim(), 1.0)).unwrap();
+        assert_eq!(found(&open, 1.0, 0.2), None);
+        let signed = MaskStack::random(SHAPE, 0.5, 3).unwrap().view().mapv(|c| 2.0 * c - 1.0);
+        assert_eq!(found(&MaskStack::new(signed).unwrap(), 1.0, 0.2), None);
+    }
 }
