@@ -78,6 +78,18 @@ fn a_shift_of_masks_of_both_signs_is_found() {
     assert!((down - 0.5).abs() < 0.1 && (right + 0.3).abs() < 0.1, "{found:?}");
 }
 
+/// Of masks that open each pixel once the sum is the same everywhere: pixels are held out.
+#[test]
+fn a_shift_of_masks_with_an_even_sum_is_found() {
+    let each = |(t, i, j): (usize, usize, usize)| f32::from((7 * i + 3 * j + i * j) % SHAPE.frames == t);
+    let told = MaskStack::new(Array3::from_shape_fn(SHAPE.dim(), each)).unwrap();
+    let real = MaskMismatch { shift: [0.5, -0.3], ..MaskMismatch::default() }.apply(&told).unwrap();
+    let y = MaskOperator::new(real).forward(scenes()[0].view());
+    let found = shifts().find(&told, None, &[y], &mut |_| ControlFlow::Continue(())).unwrap();
+    let [down, right] = found.mismatch.shift;
+    assert!((down - 0.5).abs() < 0.2 && (right + 0.3).abs() < 0.2, "{found:?}");
+}
+
 /// Where no neighbours tell anything, and where few do.
 #[test]
 fn small_sensors_are_no_trouble() {

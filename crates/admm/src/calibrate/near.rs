@@ -26,6 +26,8 @@ const MOST: f32 = 0.5;
 const FAR: f64 = 3.0;
 /// One standard deviation of the black level and the contrast that all pixels tell.
 const BY_ALL: f64 = 0.025;
+/// The least variance of S/S̄ that tells where masks sit: a tenth of that of 32 random masks.
+const UNEVEN: f64 = 3e-3;
 /// Pixels without which nothing is told.
 const LEAST: usize = 64;
 
@@ -50,7 +52,8 @@ pub(super) struct Neighbours {
 
 impl Neighbours {
     /// Of measurements with the mean of |y|. Pixels that are not `believed` are not asked, nor those among many such, or within `margin` of the edge.
-    /// Nothing for masks of both signs, whose sum does not tell how bright it is, or where next to nothing is left.
+    /// Nothing for masks of both signs, whose sum does not tell how bright it is, for those whose sum is the same at neighbouring pixels, or where next
+    /// to nothing is left.
     pub(super) fn new(
         masks: &MaskStack,
         cfa: Option<CfaPattern>,
@@ -82,7 +85,9 @@ impl Neighbours {
             }
         }
         let near = Self { views, each };
-        (near.pixels(masks.sum().view()).len() >= LEAST).then_some(near)
+        let pixels = near.pixels(masks.sum().view());
+        let uneven = pixels.iter().map(|p| (1.0 - p.open).powi(2)).sum::<f64>();
+        (pixels.len() >= LEAST && uneven > UNEVEN * pixels.len() as f64).then_some(near)
     }
 
     /// All pixels that are asked, of masks with this sum.
