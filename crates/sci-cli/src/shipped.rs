@@ -15,7 +15,7 @@ macro_rules! shipped {
 
 /// Every one, with its text.
 const SHIPPED: &[(&str, &str)] = shipped! {
-    "color/adaptive" "color/default" "color/desci" "color/fast" "color/fastdvdnet" "color/gap-fastdvdnet" "color/gap-ffdnet" "color/gap-tv" "color/gap-wavelet" "color/refined"
+    "color/adaptive" "color/default" "color/desci" "color/desci-fast" "color/fast" "color/fastdvdnet" "color/gap-fastdvdnet" "color/gap-ffdnet" "color/gap-tv" "color/gap-wavelet" "color/refined"
     "color/two-stage-fastdvdnet-ddnet" "color/two-stage-fastdvdnet-ddnet-online-reuse" "color/two-stage-ffdnet"
     "color/two-stage-ffdnet-cfd" "color/two-stage-ffdnet-ddnet" "color/two-stage-ffdnet-fast" "color/two-stage-ffdnet-online"
     "color/two-stage-ffdnet-online-ddnet" "color/two-stage-ffdnet-online-reuse-ddnet"
