@@ -183,7 +183,7 @@ pub enum CalibrateError {
 /// How far the search is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Progress {
-    /// Solves so far.
+    /// Mismatches tried so far.
     pub solves: usize,
     /// About how many there will be.
     pub expected: usize,
