@@ -67,15 +67,20 @@ fn a_blur_is_told_from_a_shift() {
     }
 }
 
+/// Of masks that are told, .5 down and .3 left, to that many pixels.
+fn assert_shift_is_found(told: &MaskStack, bound: f64) {
+    let real = MaskMismatch { shift: [0.5, -0.3], ..MaskMismatch::default() }.apply(told).unwrap();
+    let y = MaskOperator::new(real).forward(scenes()[0].view());
+    let found = shifts().find(told, None, &[y], &mut |_| ControlFlow::Continue(())).unwrap();
+    let [down, right] = found.mismatch.shift;
+    assert!((down - 0.5).abs() < bound && (right + 0.3).abs() < bound, "{found:?}");
+}
+
 /// Their sum does not tell how bright it is, so that pixels are held out.
 #[test]
 fn a_shift_of_masks_of_both_signs_is_found() {
     let told = told().differential();
-    let real = MaskMismatch { shift: [0.5, -0.3], ..MaskMismatch::default() }.apply(&told).unwrap();
-    let y = MaskOperator::new(real).forward(scenes()[0].view());
-    let found = shifts().find(&told, None, &[y], &mut |_| ControlFlow::Continue(())).unwrap();
-    let [down, right] = found.mismatch.shift;
-    assert!((down - 0.5).abs() < 0.1 && (right + 0.3).abs() < 0.1, "{found:?}");
+    assert_shift_is_found(&told, 0.1);
 }
 
 /// Of masks that open each pixel once the sum is the same everywhere: pixels are held out.
@@ -83,11 +88,7 @@ fn a_shift_of_masks_of_both_signs_is_found() {
 fn a_shift_of_masks_with_an_even_sum_is_found() {
     let each = |(t, i, j): (usize, usize, usize)| f32::from((7 * i + 3 * j + i * j) % SHAPE.frames == t);
     let told = MaskStack::new(Array3::from_shape_fn(SHAPE.dim(), each)).unwrap();
-    let real = MaskMismatch { shift: [0.5, -0.3], ..MaskMismatch::default() }.apply(&told).unwrap();
-    let y = MaskOperator::new(real).forward(scenes()[0].view());
-    let found = shifts().find(&told, None, &[y], &mut |_| ControlFlow::Continue(())).unwrap();
-    let [down, right] = found.mismatch.shift;
-    assert!((down - 0.5).abs() < 0.2 && (right + 0.3).abs() < 0.2, "{found:?}");
+    assert_shift_is_found(&told, 0.2);
 }
 
 /// Where no neighbours tell anything, and where few do.

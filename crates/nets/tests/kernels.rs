@@ -506,7 +506,6 @@ fn packed(isa: Isa, case: &Case, ops: &Operands, relu: bool) -> PackedConv {
         .expect("a valid convolution")
 }
 
-/// Whatever scratch, output and unused lanes held before, the result is that of planes, bit for bit.
 /// Fills the lanes beyond the last channel.
 fn fill_beyond(image: &mut Blocked, value: f32) {
     let (channels, height, _) = image.shape();
@@ -517,6 +516,7 @@ fn fill_beyond(image: &mut Blocked, value: f32) {
     }
 }
 
+/// Whatever scratch, output and unused lanes held before, the result is that of planes, bit for bit.
 #[test]
 fn blocked_images_give_the_bits_of_planes() -> Result<()> {
     let mut scratch = Scratch::default();
@@ -618,7 +618,8 @@ fn filters_that_are_not_finite_give_no_finite_result_in_integers() {
 /// Pixels and filters that are as large as the largest, all of one sign: no sum is too large for its integer.
 #[test]
 fn sums_of_integers_do_not_overflow() {
-    for c in [case(1, 256, 16, [8, 8], 1, 1), case(1, 256, 16, [8, 8], 2, 1)] {
+    // By the definition 2304 equal filters are rounded the same way.
+    for (c, bound) in [(case(1, 256, 16, [8, 8], 1, 1), 1e-3), (case(1, 256, 16, [8, 8], 2, 1), 5e-3)] {
         let mut ops = c.operands(1);
         ops.w.fill(0.01);
         ops.b.fill(0.0);
@@ -626,7 +627,7 @@ fn sums_of_integers_do_not_overflow() {
         for isa in with_integers() {
             let found = in_half_precision(isa, &c, &ops, &x)[c.out()[1] + 1];
             let inside = 256.0 * 9.0 * 0.03;
-            assert!((found / inside - 1.0).abs() < 5e-3, "{found} is not {inside}, {c:?} on {isa:?}");
+            assert!((found / inside - 1.0).abs() < bound, "{found} is not {inside}, {c:?} on {isa:?}");
         }
     }
 }

@@ -39,6 +39,12 @@ impl Pixel {
         let closed = 1.0 - self.open;
         ((self.y - self.open * self.light) / self.light, [closed, closed / self.light])
     }
+
+    /// What is left of that with 1 − c and b c.
+    pub(super) fn left(&self, found: [f64; 2]) -> f64 {
+        let (off, by) = self.off();
+        off - by[0] * found[0] - by[1] * found[1]
+    }
 }
 
 /// What is found.
@@ -56,36 +62,27 @@ pub(super) struct Level {
 pub(super) fn fit(pixels: &[Pixel]) -> Option<Level> {
     let mut variances: Vec<f64> = (0..=STEPS.len()).map(|step| STEPS[step.min(STEPS.len() - 1)].powi(2)).collect();
     let mut found = [0.0; 2];
-    let left = |p: &Pixel, found: [f64; 2]| {
-        let (off, by) = p.off();
-        off - by[0] * found[0] - by[1] * found[1]
-    };
     let mut normal = [0.0; 3];
     let mut weights = vec![0.0; pixels.len()];
     for round in 0..ROUNDS {
         for (p, weight) in pixels.iter().zip(&mut weights) {
             let variance = variances[step_of(p)];
-            let outlier = round > 0 && left(p, found).powi(2) > OUTLIER.powi(2) * variance;
+            let outlier = round > 0 && p.left(found).powi(2) > OUTLIER.powi(2) * variance;
             *weight = if outlier { 0.0 } else { 1.0 / variance };
         }
-        let mut right = [0.0; 2];
-        normal = [0.0; 3];
-        for (p, weight) in pixels.iter().zip(&weights) {
-            let (off, [a, b]) = p.off();
-            normal = [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b];
-            right = [right[0] + weight * a * off, right[1] + weight * b * off];
-        }
+        let right;
+        (normal, right) = weighted_sums(pixels.iter().zip(weights.iter().copied()));
         found = solve(normal, right)?;
         // Pixels that are closed as they were told cannot be more so.
         if found[0] < 0.0 {
             found = [0.0, right[1] / normal[2]];
         }
-        variances = variances_of(pixels, |p| left(p, found));
+        variances = variances_of(pixels, |p| p.left(found));
     }
     // Errors of one tile have a common cause: each tile's pull counts once.
     let mut pulls = vec![[0.0; 2]; super::TILES * super::TILES];
     for (p, weight) in pixels.iter().zip(&weights) {
-        let pull = weight * left(p, found);
+        let pull = weight * p.left(found);
         let (_, by) = p.off();
         (0..2).for_each(|k| pulls[p.tile][k] += pull * by[k]);
     }
@@ -115,6 +112,17 @@ fn variances_of(pixels: &[Pixel], left: impl Fn(&Pixel) -> f64) -> Vec<f64> {
         *variance = next.max(1e-6);
     }
     variances
+}
+
+/// The left and the right side of the equations of 1 − c and b c, of pixels with their weights.
+pub(super) fn weighted_sums<'p>(pixels: impl Iterator<Item = (&'p Pixel, f64)>) -> ([f64; 3], [f64; 2]) {
+    pixels.fold(([0.0; 3], [0.0; 2]), |(normal, right), (p, weight)| {
+        let (off, [a, b]) = p.off();
+        (
+            [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b],
+            [right[0] + weight * a * off, right[1] + weight * b * off],
+        )
+    })
 }
 
 /// The solution of `[[n₀, n₁], [n₁, n₂]] x = right`.

@@ -6,8 +6,8 @@
 //! ([`level`]), where there are such, else by all.
 //!
 //! The sum of masks does not tell a share of the neighbouring frame, nor how bright it is around a pixel of masks of both signs, and where it is even
-//! it tells nothing. Then they are found by pixels that are held out: the others are solved by a few iterations of GAP-TV, and the mismatch with which the video predicts them best
-//! is taken, of `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
+//! it tells nothing. Then they are found by pixels that are held out: the others are solved by a few iterations of GAP-TV, and the mismatch with which
+//! the video predicts them best is taken, of `E(θ) = Σ ‖y − b − H_θ x_θ‖² / Σ ‖y‖²` over them, which needs no truth. Held out is one pixel in [`Calibration::spacing`].
 //!
 //! Clipped pixels only say that there was at least so much light: they are not asked. What the data cannot tell stays as it was told: a parameter whose
 //! value is less than twice its uncertainty from that, or, by held-out pixels, without which the error is less than 12 % above the least. How much light

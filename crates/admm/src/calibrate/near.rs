@@ -123,8 +123,7 @@ impl Neighbours {
         let found = fitted(&pixels).unwrap_or([0.0; 2]);
         let mut errors = [0.0; GROUPS];
         for p in &pixels {
-            let (off, by) = p.off();
-            let left = (off - by[0] * found[0] - by[1] * found[1]).abs() * weight(p).sqrt();
+            let left = p.left(found).abs() * weight(p).sqrt();
             let error = if left < FAR { left * left } else { FAR * (2.0 * left - FAR) };
             errors[p.group] += error / pixels.len().max(1) as f64;
         }
@@ -172,13 +171,7 @@ fn weight(p: &Pixel) -> f64 {
 
 /// 1 − c and b c by weighted least squares.
 fn fitted(pixels: &[Pixel]) -> Option<[f64; 2]> {
-    let (mut normal, mut right) = ([0.0; 3], [0.0; 2]);
-    for p in pixels {
-        let (off, [a, b]) = p.off();
-        let weight = weight(p);
-        normal = [normal[0] + weight * a * a, normal[1] + weight * a * b, normal[2] + weight * b * b];
-        right = [right[0] + weight * a * off, right[1] + weight * b * off];
-    }
+    let (normal, right) = level::weighted_sums(pixels.iter().map(|p| (p, weight(p))));
     level::solve(normal, right)
 }
 

@@ -105,7 +105,7 @@ impl<'s> Search<'s> {
         self.search(By::Neighbours)?;
         self.level()?;
         self.search(By::HeldOut)?;
-        let mut last = self.judge.held_out(&self.best)?.total();
+        let mut last = if self.best == self.told { first } else { self.judge.held_out(&self.best)?.total() };
         // What predicts no better is not what is there.
         if last > first {
             (self.best, last) = (self.told, first);

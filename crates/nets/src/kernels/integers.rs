@@ -43,7 +43,7 @@ pub(super) fn with_half(pair: f32, place: usize, number: i16) -> f32 {
 /// The largest |pixel| of these rows and columns of all `channels`; NaN if one is not finite. Lanes beyond the last channel are not looked at.
 #[inline(always)]
 pub(super) unsafe fn largest<S: Pairs>(src: View, channels: usize, rows: Range<usize>, columns: Range<usize>) -> f32 {
-    // SAFETY: the caller gives the pixels; `magnitudes` has twice as many lanes.
+    // SAFETY: the caller gives the pixels; [`MAGNITUDES`] has twice as many lanes.
     unsafe {
         let mut most = S::NO_SUMS;
         let mut b = 0;
