@@ -55,6 +55,15 @@ fn a_shift_of_any_sign_is_found_in_every_scene() {
     }
 }
 
+/// The least error of a range may lie at its end because the masks sit beyond.
+#[test]
+fn what_lies_beyond_reach_is_not_called_found() {
+    let shift = [0.0, 1.4];
+    let near = Calibration { reach: 1.0, ..shifts() };
+    let found = find(&near, measured(&scenes()[0], &MaskMismatch { shift, ..MaskMismatch::default() }));
+    assert!(found.parameters.iter().all(|p| p.value.abs() < 1.0 && p.told_apart == (p.value != 0.0)), "{found:?}");
+}
+
 #[test]
 fn a_blur_is_told_from_a_shift() {
     let truth = &scenes()[1];
@@ -79,8 +88,22 @@ fn assert_shift_is_found(told: &MaskStack, bound: f64) {
 /// Their sum does not tell how bright it is, so that pixels are held out.
 #[test]
 fn a_shift_of_masks_of_both_signs_is_found() {
-    let told = told().differential();
+    let told = told().differential().unwrap();
     assert_shift_is_found(&told, 0.1);
+}
+
+/// Each pixel is open in half of the frames and shut in the others: the sum is nothing.
+#[test]
+fn a_shift_of_balanced_masks_of_both_signs_is_found() {
+    let random = told();
+    let half = SHAPE.frames / 2;
+    let each = |(t, i, j): (usize, usize, usize)| {
+        let open = random.view()[[t % half, i, j]];
+        if t < half { 2.0 * open - 1.0 } else { 1.0 - 2.0 * open }
+    };
+    let balanced = MaskStack::new(Array3::from_shape_fn(SHAPE.dim(), each)).unwrap();
+    assert!(SHAPE.frames % 2 == 0 && balanced.sum().iter().all(|&sum| sum == 0.0));
+    assert_shift_is_found(&balanced, 0.1);
 }
 
 /// Of masks that open each pixel once the sum is the same everywhere: pixels are held out.

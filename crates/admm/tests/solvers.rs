@@ -92,6 +92,27 @@ fn admm_with_known_noise_reaches_its_exact_fixed_point() {
     assert!(worst < 2e-5, "largest difference {worst}");
 }
 
+/// A momentum that starts anew explains y no more closely than the noise allows.
+#[test]
+fn a_restart_knows_the_noise_too() {
+    let noise = gaussian(SHAPE.image_dim(), 3) * 0.2;
+    let unaware = Measurement::new(operator(), &noise + &measurement().y()).unwrap();
+    let told = sci_forward::Noise::new(None, 0.2).unwrap();
+    let plan = Plan::new([0.1, 0.01].map(|sigma| Stage { sigma: Some(sigma), iterations: 1 }));
+    let last_input = |problem: &Measurement| {
+        let mut seen = Array3::zeros(SHAPE.dim());
+        let see = Map(|_: &Call<'_>, x: ArrayView4<'_, f32>| {
+            seen.assign(&x.index_axis(Axis(1), 0));
+            x.mapv(|v| 0.9 * v)
+        });
+        run(&mut Gap::accelerated(see).restarting(), problem, Start::Mean, &plan, &mut ()).unwrap();
+        let off = problem.residual(seen.insert_axis(Axis(1)).view()).unwrap();
+        off.mapv(|d| d * d).mean().unwrap().sqrt()
+    };
+    let (exact, damped) = (last_input(&unaware), last_input(&unaware.clone().with_noise(Some(told))));
+    assert!(exact < 1e-4 && damped > 0.02, "{exact}, {damped}");
+}
+
 /// Whatever noise is told, what is left of the residual is not added up for ever. With half of it told the error rises and falls with the
 /// iterations, and rounding, another on each processor, decides when.
 #[test]
@@ -453,7 +474,7 @@ fn every_iteration_turns_the_video_another_way_round_and_back() {
 fn masks_of_both_signs_are_solved_from_every_start() {
     let shape = VideoShape { frames: 6, height: 48, width: 48 };
     let truth = moving_square(shape);
-    let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap().differential()));
+    let h = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap().differential().unwrap()));
     let measurement = Measurement::new(h.clone(), h.forward(truth.view())).unwrap();
     let plan = |iterations| Plan::new([Stage { sigma: None, iterations }]);
     let solve = |start: Start<'_>, iterations| {

@@ -78,7 +78,9 @@ fn groups_are_kept_from_call_to_call() {
     call(4, &noisy);
     assert!(call(5, &other) != anew && call(6, &other) != anew);
     assert!(call(7, &other) == anew);
-    // A solve that begins is not one that goes on, and another size is another video.
+    // A solve that begins is not one that goes on, nor is one that left a call out, and another size is another video.
+    call(4, &noisy);
+    assert!(call(6, &other) == anew);
     call(4, &noisy);
     assert!(call(0, &other) == anew);
     let part = other.slice(ndarray::s![.., .., 4.., ..]).to_owned();

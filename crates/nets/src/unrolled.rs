@@ -13,7 +13,7 @@ use admm::{
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use ndarray::{Array2, Array3, Array4, ArrayView3, ArrayView4, ArrayViewMut4, Axis};
-use sci_forward::bayer::{Malvar, Menon, mosaic_adjoint_into};
+use sci_forward::bayer::{Malvar, Menon, mosaic_adjoint_into, mosaic_into};
 use sci_forward::{Demosaicer, Measurement, SensingOperator};
 use std::fmt::Display;
 
@@ -216,7 +216,7 @@ impl Recipe {
     ) -> Result<Gradients> {
         let mut share = 0.5 / (1.0 - 0.5f32.powi(calls.len() as i32));
         let mut total = Gradients::zero(vars.len());
-        let mut back: Option<Array4<f32>> = None;
+        let mut later: Option<(Array4<f32>, &RecordedCall)> = None;
         let mut to_momentum = Array2::zeros(measurement.shape().image_dim());
         for call in calls.iter().rev() {
             let input = Var::from_tensor(&tensor(call.input.clone())?)?;
@@ -224,8 +224,9 @@ impl Recipe {
             let values = Array4::from_shape_vec(v.dims4()?, v.flatten_all()?.to_vec1::<f32>()?).map_err(unusable)?;
             let (own, mut upstream) = loss(values.view()).map_err(unusable)?;
             upstream *= share;
-            if let Some(back) = back.take() {
-                upstream += &back;
+            if let Some((to_input, next)) = later.take() {
+                let inactive = inactive(measurement, values.view(), next.input.view());
+                upstream += &self.through_iteration(measurement, to_input, &inactive, &mut to_momentum)?;
             }
             let gradients = (v * tensor(upstream)?)?.sum_all()?.backward()?;
             total.add_found(share * own, &gradients, vars)?;
@@ -233,7 +234,7 @@ impl Recipe {
             if let Some(to_input) = gradients.get(&input) {
                 let to_input = to_input.flatten_all()?.to_vec1()?;
                 let to_input = Array4::from_shape_vec(input.dims4()?, to_input).map_err(unusable)?;
-                back = Some(self.through_iteration(measurement, to_input, &mut to_momentum)?);
+                later = Some((to_input, call));
             }
         }
         Ok(total)
@@ -251,16 +252,17 @@ impl Recipe {
         &self,
         measurement: &Measurement,
         to_input: Array4<f32>,
+        inactive: &[usize],
         to_momentum: &mut Array2<f32>,
     ) -> Result<Array4<f32>> {
         let operator = measurement.operator();
         let Some(cfa) = measurement.cfa() else {
             let to_x = to_input.index_axis(Axis(1), 0);
-            return Ok(self.through_projection(operator, to_x, to_momentum).insert_axis(Axis(1)));
+            return Ok(self.through_projection(operator, to_x, inactive, to_momentum).insert_axis(Axis(1)));
         };
         let mut to_x = Array3::zeros(operator.shape().dim());
         Malvar.adjoint(cfa, to_input.view(), to_x.view_mut()).map_err(unusable)?;
-        let to_mosaic = self.through_projection(operator, to_x.view(), to_momentum);
+        let to_mosaic = self.through_projection(operator, to_x.view(), inactive, to_momentum);
         let mut to_v = to_input;
         mosaic_adjoint_into(cfa, to_mosaic.view(), to_v.view_mut());
         Ok(to_v)
@@ -273,22 +275,44 @@ impl Recipe {
     /// ```
     ///
     /// to `∂ℓ/∂v` and `∂ℓ/∂y1` before it: with `q = H ∂x / diag(H Hᵀ)`, `∂y1 ← ∂y1 + q` and `∂v = ∂x − Hᵀ (q + ∂y1)`. In plain GAP y1 is y, and
-    /// `∂v = ∂x − Hᵀ q`.
+    /// `∂v = ∂x − Hᵀ q`. A clipped pixel that v gave enough light is `inactive`: nothing goes through it, nor through its y1.
     fn through_projection(
         &self,
         operator: &dyn SensingOperator,
         to_x: ArrayView3<'_, f32>,
+        inactive: &[usize],
         to_y1: &mut Array2<f32>,
     ) -> Array3<f32> {
         let mut q = operator.forward(to_x);
         // Where no mask is open H is zero, and so is what is divided.
         q.zip_mut_with(&operator.gram(), |q, &d| *q = if d > 0.0 { *q / d } else { 0.0 });
+        for &pixel in inactive {
+            let at = [pixel / q.ncols(), pixel % q.ncols()];
+            (q[at], to_y1[at]) = (0.0, 0.0);
+        }
         if self.accelerate {
             *to_y1 += &q;
             q += &*to_y1;
         }
         &to_x - &operator.adjoint(q.view())
     }
+}
+
+/// The clipped pixels at which the data step from v to x, both `[T, C, H, W]`, left v as it was, since it gave them enough light: those whose light
+/// has not become more, but for rounding. Counted through the rows.
+fn inactive(measurement: &Measurement, v: ArrayView4<'_, f32>, x: ArrayView4<'_, f32>) -> Vec<usize> {
+    let Some(level) = measurement.clip() else { return Vec::new() };
+    let light = |video: ArrayView4<'_, f32>| {
+        let mut sensor = Array3::zeros(measurement.shape().dim());
+        match measurement.cfa() {
+            Some(cfa) => mosaic_into(cfa, video, sensor.view_mut()),
+            None => sensor.assign(&video.index_axis(Axis(1), 0)),
+        }
+        measurement.operator().forward(sensor.view())
+    };
+    let (before, after) = (light(v), light(x));
+    let pixels = before.iter().zip(&after).zip(measurement.y()).enumerate();
+    pixels.filter(|(_, ((v, x), y))| **y >= level && **x - **v <= 1e-3 * **y).map(|(pixel, _)| pixel).collect()
 }
 
 /// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.
@@ -344,7 +368,6 @@ pub(crate) fn tensor(video: Array4<f32>) -> Result<Tensor> {
 mod tests {
     use super::*;
     use crate::{Ffdnet, FfdnetLayout, FfdnetSpec, Layers};
-    use sci_forward::bayer::mosaic_into;
     use sci_forward::{CfaPattern, MaskOperator, MaskStack, VideoShape};
     use std::sync::Arc;
 
@@ -354,8 +377,18 @@ mod tests {
     fn the_gradient_is_that_of_the_whole_loss() {
         let clip = Array4::from_shape_fn((3, 1, 12, 12), |(t, _, y, x)| ((7 * t + 5 * y + 3 * x) % 11) as f32 / 11.0);
         for accelerate in [true, false] {
-            let (slope, norm) = slope_along_gradient(clip.clone(), accelerate);
+            let (slope, norm) = slope_along_gradient(clip.clone(), accelerate, None);
             assert!((slope - norm).abs() < 0.01 * norm, "slope {slope}, gradient {norm}");
+        }
+    }
+
+    /// A third of the pixels is clipped: where a video gives them enough light the data step leaves it alone.
+    #[test]
+    fn the_gradient_knows_which_clipped_pixels_ask_for_more() {
+        let clip = Array4::from_shape_fn((3, 1, 12, 12), |(t, _, y, x)| ((7 * t + 5 * y + 3 * x) % 11) as f32 / 11.0);
+        for accelerate in [true, false] {
+            let (slope, norm) = slope_along_gradient(clip.clone(), accelerate, Some(0.9));
+            assert!((slope - norm).abs() < 0.02 * norm, "slope {slope}, gradient {norm}");
         }
     }
 
@@ -365,12 +398,12 @@ mod tests {
         let wave =
             |t: usize, c: usize, y: usize, x: usize| (0.5 * (t + y) as f32 + 0.3 * x as f32 + 0.7 * c as f32).sin();
         let clip = Array4::from_shape_fn((3, 3, 12, 12), |(t, c, y, x)| 0.5 + 0.3 * wave(t, c, y, x));
-        let (slope, norm) = slope_along_gradient(clip, true);
+        let (slope, norm) = slope_along_gradient(clip, true, None);
         assert!((slope - norm).abs() < 0.25 * norm, "slope {slope}, gradient {norm}");
     }
 
-    /// A clip through random masks, a tenth of the pixels not measured.
-    fn measured(clip: &Array4<f32>) -> Measurement {
+    /// A clip through random masks, a tenth of the pixels not measured, by a sensor that clips at a level.
+    fn measured(clip: &Array4<f32>, level: Option<f32>) -> Measurement {
         let (frames, channels, height, width) = clip.dim();
         let shape = VideoShape { frames, height, width };
         let operator = Arc::new(MaskOperator::new(MaskStack::random(shape, 0.5, 2).unwrap()));
@@ -378,19 +411,20 @@ mod tests {
         if channels == 3 {
             mosaic_into(CfaPattern::Grbg, clip.view(), seen.view_mut());
         }
-        let whole = Measurement::new(operator.clone(), operator.forward(seen.view())).unwrap();
+        let y = operator.forward(seen.view()).mapv_into(|y| level.map_or(y, |level| y.min(level)));
+        let whole = Measurement::new(operator, y).unwrap().with_clip(level);
         let kept = Array2::from_shape_fn((height, width), |(y, x)| (3 * y + x) % 10 > 0);
         whole.with_cfa((channels == 3).then_some(CfaPattern::Grbg)).restricted(kept.view()).unwrap()
     }
 
     /// How the loss of three calls changes along its gradient by difference, and the gradient's length.
-    fn slope_along_gradient(clip: Array4<f32>, accelerate: bool) -> (f64, f64) {
+    fn slope_along_gradient(clip: Array4<f32>, accelerate: bool, level: Option<f32>) -> (f64, f64) {
         let channels = clip.len_of(Axis(1));
         let spec = FfdnetSpec { channels, width: 8, depth: 3, layout: FfdnetLayout::Residual { batch_norm: false } };
         let mut net = Ffdnet::random(spec, 1).unwrap();
         let sigmas = [40.0, 30.0, 20.0].map(|sigma| sigma / 255.0).to_vec();
         let recipe = Recipe { sigmas, accelerate, start: None, flips: true, dim: 1.3 };
-        let (measurement, vars) = (measured(&clip), net.make_trainable().unwrap());
+        let (measurement, vars) = (measured(&clip, level), net.make_trainable().unwrap());
         let squared = |v: ArrayView4<'_, f32>| {
             let error = &v - &clip;
             let count = error.len() as f32;

@@ -121,6 +121,7 @@ fn camera() -> CameraConfig {
         holes: 0.1,
         saturated: 0.2,
         mask_errors: 0.2,
+        mask_grain: 0.1,
     }
 }
 

@@ -88,7 +88,11 @@ pub fn continuation(previous: ArrayView3<'_, f32>, measurement: &Measurement) ->
 
 /// `‖y − H x‖ / ‖y‖` over the open pixels.
 fn relative_residual(measurement: &Measurement, hx: &Array2<f32>) -> f64 {
-    let open = Zip::from(hx).and(measurement.y()).and(measurement.operator().gram());
+    let mut y = measurement.y().to_owned();
+    if let (Some(y), Some(hx)) = (y.as_slice_mut(), hx.as_slice()) {
+        measurement.one_sided(y, hx);
+    }
+    let open = Zip::from(hx).and(&y).and(measurement.operator().gram());
     let squares = open.fold(0.0, |sum, &hx, &y, &gram| if gram > 0.0 { sum + f64::from(hx - y).powi(2) } else { sum });
     squares.sqrt() / measurement.scale()
 }
@@ -120,4 +124,25 @@ fn constant_image(measurement: &Measurement, transmitted: &Array2<f32>) -> Array
         below += f64::from(a * a);
     });
     transmitted * (above / below.max(f64::MIN_POSITIVE)) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sci_forward::testing::moving_square;
+    use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+    use std::sync::Arc;
+
+    /// The same scene again, brighter than the sensor can tell.
+    #[test]
+    fn a_result_brighter_than_clipped_pixels_is_no_error() {
+        let shape = VideoShape { frames: 4, height: 24, width: 32 };
+        let h = MaskOperator::new(MaskStack::random(shape, 0.5, 1).unwrap());
+        let truth = moving_square(shape);
+        let y = h.forward(truth.view());
+        let level = 0.6 * y.iter().copied().fold(0.0, f32::max);
+        let clipped = Measurement::new(Arc::new(h), y.mapv(|y| y.min(level))).unwrap().with_clip(Some(level));
+        let (_, relation) = continuation(truth.view(), &clipped);
+        assert!(relation.previous < 1e-5, "{relation:?}");
+    }
 }

@@ -293,10 +293,10 @@ impl<'m> Scene<'m> {
         let whole = Measurement::new(Arc::new(operator), self.measurement.y().slice(area).to_owned()).ok()?;
         let whole = whole.with_cfa(self.measurement.cfa()).with_clip(self.measurement.clip());
         let judges = self.judges.slice(area);
-        let open = whole.operator().gram();
+        let (open, least) = (whole.operator().gram(), whole.least_telling());
         let mut asked = Array2::from_elem((h, w), false);
         Zip::from(&mut asked).and(judges).and(open).for_each(|asked, &judge, &open| {
-            *asked = ask(judge, rng.random()) && open > 0.0;
+            *asked = ask(judge, rng.random()) && open > 0.0 && open >= least;
         });
         if !asked.iter().any(|&asked| asked) {
             return None;

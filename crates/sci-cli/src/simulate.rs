@@ -115,7 +115,7 @@ mod tests {
     /// Each of two readings has its black level and its noise: the one cancels out, the other adds up.
     #[test]
     fn a_differential_camera_is_read_twice() {
-        let masks = MaskStack::random(SHAPE, 0.5, 1).unwrap().differential();
+        let masks = MaskStack::random(SHAPE, 0.5, 1).unwrap().differential().unwrap();
         let read = |readout| {
             let truth = Truth::Sensor(Array3::from_shape_fn((6, 12, 16), |(t, i, j)| (t + i + j) as f32 / 40.0));
             let camera = Camera { readout, ..Camera::default() };

@@ -26,7 +26,9 @@ pub fn brightness(y: ArrayView2<'_, f32>, open: ArrayView2<'_, f32>, radius: usi
     };
     let (both, squares) = (product(|y, open| y * open), product(|_, open| open * open));
     let mut u = square_sums(&both, radius);
-    u.zip_mut_with(&square_sums(&squares, radius), |u, &s| *u = if s > 0.0 { *u / s } else { 0.0 });
+    // What differences of large sums leave of nothing.
+    let nothing = 1e-12 * squares.iter().map(|&s| f64::from(s)).sum::<f64>() as f32;
+    u.zip_mut_with(&square_sums(&squares, radius), |u, &s| *u = if s > nothing { *u / s } else { 0.0 });
     u
 }
 

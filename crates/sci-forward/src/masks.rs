@@ -155,12 +155,15 @@ impl MaskStack {
     ///
     /// ```
     /// use ndarray::array;
-    /// let masks = sci_forward::MaskStack::new(array![[[0.0, 1.0, 0.5]]])?.differential();
+    /// let masks = sci_forward::MaskStack::new(array![[[0.0, 1.0, 0.5]]])?.differential()?;
     /// assert_eq!(masks.view(), array![[[-1.0, 1.0, 0.0]]]);
     /// # Ok::<(), sci_forward::MaskError>(())
     /// ```
-    pub fn differential(self) -> Self {
-        Self { masks: self.masks.mapv_into(|c| 2.0 * c - 1.0) }
+    ///
+    /// # Errors
+    /// As [`MaskStack::new`]: masks of 0.5 everywhere measure nothing.
+    pub fn differential(self) -> Result<Self, MaskError> {
+        Self::new(self.masks.mapv_into(|c| 2.0 * c - 1.0))
     }
 
     /// The size of the video that these masks modulate.

@@ -155,6 +155,25 @@ impl Measurement {
         self.variance.as_ref().map(|variance| variance.view())
     }
 
+    /// The least `diag(H Hᵀ)` of a pixel that tells something of the video: a fiftieth of the mean of those that are open at all. What is
+    /// divided by less is the sensor's noise.
+    ///
+    /// ```
+    /// use ndarray::array;
+    /// use sci_forward::{MaskOperator, MaskStack, Measurement};
+    /// use std::sync::Arc;
+    ///
+    /// let h = Arc::new(MaskOperator::new(MaskStack::new(array![[[1.0, 1.0, 0.01, 0.0]]])?));
+    /// let least = Measurement::new(h, array![[0.5, 0.2, 0.1, 0.0]])?.least_telling();
+    /// assert!(least > 0.01 * 0.01 && least < 1.0);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn least_telling(&self) -> f32 {
+        let open = self.operator.gram();
+        let (sum, count) = open.iter().filter(|&&g| g > 0.0).fold((0.0, 0), |(sum, n), &g| (sum + f64::from(g), n + 1));
+        (sum / (50 * count.max(1)) as f64) as f32
+    }
+
     /// `H`.
     pub fn operator(&self) -> &dyn SensingOperator {
         &*self.operator

@@ -16,7 +16,7 @@ const LARGEST_CORRELATION: f64 = 0.12;
 ///
 /// Of a scene that stands still, `s = y / Σ_t C_t` is a picture of it, and the difference d of two neighbours in s has
 /// nothing to do with which masks are open there. Where something moves, s is mottled by the masks. With
-/// `w_t = C_t(p)/ΣC(p) − C_t(q)/ΣC(q)` for neighbours p and q in a row:
+/// `w_t = C_t(p)/ΣC(p) − C_t(q)/ΣC(q)` for neighbours p and q in a row, of the same color on a color sensor:
 ///
 /// * if the brightness of a block changes from frame to frame, `d = Σ_t w_t x_t + …`: in each block of 16 × 16 pixels the share of
 ///   d² that w explains by least squares, in units of what it explains of noise (F of T − 1 degrees of freedom), is at most 3;
@@ -28,7 +28,8 @@ pub fn still(measurement: &Measurement) -> Vec<bool> {
     let grid = Grid { height, width, side: SIDE };
     let masks = measurement.operator().adjoint(Array2::ones((height, width)).view());
     let sum = masks.sum_axis(ndarray::Axis(0));
-    let picture = Picture { masks, sum, measurement };
+    let apart = if measurement.cfa().is_some() { 2 } else { 1 };
+    let picture = Picture { masks, sum, apart, least: measurement.least_telling(), measurement };
     (0..grid.len())
         .into_par_iter()
         .map(|tile| {
@@ -39,7 +40,7 @@ pub fn still(measurement: &Measurement) -> Vec<bool> {
                 for left in columns.clone().step_by(BLOCK) {
                     let mut fit = Fit::new(frames);
                     for row in top..(top + BLOCK).min(rows.end) {
-                        for column in left..(left + BLOCK).min(columns.end).min(width - 1) {
+                        for column in left..(left + BLOCK).min(columns.end).min(width.saturating_sub(apart)) {
                             if let Some((d, w)) = picture.difference(row, column) {
                                 of_tile.add(d.abs(), w.dot(&w).sqrt());
                                 fit.add(d, &w);
@@ -57,15 +58,20 @@ pub fn still(measurement: &Measurement) -> Vec<bool> {
 struct Picture<'a> {
     masks: Array3<f32>,
     sum: Array2<f32>,
+    /// From a pixel to its neighbour.
+    apart: usize,
+    /// [`Measurement::least_telling`].
+    least: f32,
     measurement: &'a Measurement,
 }
 
 impl Picture<'_> {
-    /// d and w of a pixel and its right neighbour, if both are open.
+    /// d and w of a pixel and its right neighbour, if the masks tell something of both.
     fn difference(&self, row: usize, column: usize) -> Option<(f64, Array1<f64>)> {
-        let (p, q) = ([row, column], [row, column + 1]);
+        let (p, q) = ([row, column], [row, column + self.apart]);
         let (sum_p, sum_q) = (f64::from(self.sum[p]), f64::from(self.sum[q]));
-        if sum_p <= 0.0 || sum_q <= 0.0 {
+        let gram = self.measurement.operator().gram();
+        if sum_p <= 0.0 || sum_q <= 0.0 || gram[p].min(gram[q]) < self.least {
             return None;
         }
         let d = f64::from(self.measurement.y()[p]) / sum_p - f64::from(self.measurement.y()[q]) / sum_q;
@@ -173,7 +179,7 @@ impl Correlation {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sci_forward::{MaskOperator, MaskStack, SensingOperator, VideoShape};
+    use sci_forward::{CfaPattern, MaskOperator, MaskStack, SensingOperator, VideoShape};
     use std::sync::Arc;
 
     const SHAPE: VideoShape = VideoShape { frames: 8, height: 64, width: 96 };
@@ -185,9 +191,13 @@ mod tests {
     }
 
     fn tiles(video: impl Fn(usize, usize, usize) -> f32) -> Vec<bool> {
+        on_sensor(None, video)
+    }
+
+    fn on_sensor(cfa: Option<CfaPattern>, video: impl Fn(usize, usize, usize) -> f32) -> Vec<bool> {
         let h = MaskOperator::new(MaskStack::random(SHAPE, 0.5, 2).unwrap());
         let y = h.forward(Array3::from_shape_fn(SHAPE.dim(), |(t, i, j)| video(t, i, j)).view());
-        still(&Measurement::new(Arc::new(h), y).unwrap())
+        still(&Measurement::new(Arc::new(h), y).unwrap().with_cfa(cfa))
     }
 
     #[test]
@@ -209,5 +219,18 @@ mod tests {
             if on { 1.0 } else { scene(i as f64, j as f64) }
         });
         assert_eq!(tiles, [true, true, true, true, true, false]);
+    }
+
+    /// Pixels beside each other differ by their color more than by anything that moves.
+    #[test]
+    fn on_a_color_sensor_it_is_seen_too() {
+        let color = |i: usize, j: usize| [[1.0, 0.5], [0.5, 0.2]][i % 2][j % 2];
+        let of = |speed: f64| {
+            let moved = move |t: usize, i: usize, j: usize| color(i, j) * scene(i as f64, j as f64 + speed * t as f64);
+            on_sensor(Some(CfaPattern::Rggb), moved)
+        };
+        assert_eq!((of(0.0), of(2.0)), (vec![true; 6], vec![false; 6]));
+        let brighter = |t: usize, i: usize, j: usize| color(i, j) * (0.5 + 0.02 * t as f32) * scene(i as f64, j as f64);
+        assert_eq!(on_sensor(Some(CfaPattern::Rggb), brighter), [false; 6]);
     }
 }

@@ -176,7 +176,7 @@ impl<D: Denoiser> Tiles<D> {
     ) -> Result<(), BoxError> {
         let mean = mean_frame(noisy).insert_axis(Axis(0));
         let mut denoised = Array4::zeros(mean.dim());
-        self.inner.denoise(call, mean.view(), denoised.view_mut())?;
+        self.inner.denoise(&call.without_measurement(), mean.view(), denoised.view_mut())?;
         for (rows, columns) in tiles {
             let from = denoised.slice(s![0, .., rows.clone(), columns.clone()]);
             for mut frame in out.slice_mut(s![.., .., rows.clone(), columns.clone()]).outer_iter_mut() {
@@ -229,7 +229,7 @@ impl<D: Denoiser> Denoiser for Tiles<D> {
         for ((rows, columns), (halo_rows, halo_columns)) in moving.iter().zip(&with_halo) {
             let input = noisy.slice(s![.., .., halo_rows.clone(), halo_columns.clone()]).to_owned();
             let mut denoised = Array4::zeros(input.dim());
-            self.inner.denoise(call, input.view(), denoised.view_mut())?;
+            self.inner.denoise(&call.without_measurement(), input.view(), denoised.view_mut())?;
             let (top, left) = (rows.start - halo_rows.start, columns.start - halo_columns.start);
             let core = denoised.slice(s![.., .., top..top + rows.len(), left..left + columns.len()]);
             out.slice_mut(s![.., .., rows.clone(), columns.clone()]).assign(&core);

@@ -284,7 +284,7 @@ impl Errors {
 struct Judge<'a> {
     masks: &'a MaskStack,
     /// Their sum, as one mask.
-    open: MaskStack,
+    open: Option<MaskStack>,
     /// What the sum is judged by, if it tells something.
     near: Option<Neighbours>,
     cfa: Option<CfaPattern>,
@@ -333,14 +333,19 @@ impl<'a> Judge<'a> {
         let margin = RADIUS + settings.reach.ceil() as usize + 1;
         let groups = drawn.mapv(|(group, _)| group);
         let near = Neighbours::new(masks, cfa, (measurements, level), &believed, &groups, margin);
-        let open = MaskStack::new(masks.sum().insert_axis(Axis(0)))?;
+        // Of masks of both signs the sum may be nothing, and nobody asks for it.
+        let open = near.as_ref().map(|_| MaskStack::new(masks.sum().insert_axis(Axis(0)))).transpose()?;
         Ok(Self { masks, open, near, cfa, measurements, clip, given, asked, level, power })
     }
 
     /// The sum of masks that sit as in `point`.
+    ///
+    /// # Panics
+    /// Without neighbours, as of masks of both signs.
     fn open(&self, point: &Point) -> Result<Array2<f32>, CalibrateError> {
+        let open = self.open.as_ref().expect("asked for where neighbours tell");
         let moved = MaskMismatch { clock: 0.0, contrast: 1.0, ends: [0.0; 2], ..point.mismatch };
-        Ok(moved.apply(&self.open)?.sum())
+        Ok(moved.apply(open)?.sum())
     }
 
     /// E of a mismatch by held-out pixels, shared out among the groups.

@@ -235,8 +235,12 @@ impl<'s> Search<'s> {
 
     /// Each group of pixels has a parabola of its own; the spread of their minima, by the root of their number.
     fn uncertainty(&mut self, axis: usize) -> Result<f64, CalibrateError> {
-        let (at, step) = ((self.axes[axis].get)(&self.best), self.axes[axis].step);
-        let middle = self.best_errors;
+        let Axis { get, step, range: (least, most), .. } = self.axes[axis];
+        let (at, middle) = (get(&self.best), self.best_errors);
+        // The least error of a range that lies at its end may lie anywhere beyond.
+        if (at <= least || at >= most) && at != get(&self.told) {
+            return Ok(f64::INFINITY);
+        }
         let (below, above) = (self.errors(&self.with(axis, at - step))?, self.errors(&self.with(axis, at + step))?);
         let curvature = |g: usize| below.0[g] - 2.0 * middle.0[g] + above.0[g];
         let total: f64 = (0..GROUPS).map(curvature).sum();

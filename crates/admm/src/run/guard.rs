@@ -63,9 +63,13 @@ impl Guard {
 /// How large `‖x‖` is expected to be at most, from the shortest video that has the measurement: `√(B Σ y² / diag(H Hᵀ))` over the
 /// measured pixels, the others taken to be like them. A still scene, and one that is bright in one frame only, are no larger.
 fn level(measurement: &Measurement) -> f64 {
-    let (y, gram) = (measurement.y(), measurement.operator().gram());
+    let (y, gram, least) = (measurement.y(), measurement.operator().gram(), measurement.least_telling());
     let (sum, count) = ndarray::Zip::from(y).and(gram).fold((0f64, 0usize), |(sum, count), &y, &gram| {
-        if gram > 0.0 { (sum + f64::from(y).powi(2) / f64::from(gram), count + 1) } else { (sum, count) }
+        if gram > 0.0 && gram >= least {
+            (sum + f64::from(y).powi(2) / f64::from(gram), count + 1)
+        } else {
+            (sum, count)
+        }
     });
     let pixels = y.len() as f64;
     let frames = measurement.shape().frames as f64;

@@ -17,7 +17,7 @@ use sci_forward::Measurement;
 /// E(x) = mean over held-out pixels of r²/g  +  mean over the others of r²/(g T)
 /// ```
 ///
-/// At a pixel held out, r is a sum of T errors that no data step has touched, with variance g · MSE when they are
+/// Pixels that masks leave nearly closed ([`Measurement::least_telling`]) are not asked. At a pixel held out, r is a sum of T errors that no data step has touched, with variance g · MSE when they are
 /// independent. At the others it is the part of the error in the range of `Hᵀ`, 1/T of the dimensions, which a jump of σ
 /// makes large where the pixels held out see nothing.
 ///
@@ -169,9 +169,10 @@ impl HeldOut {
     /// Nothing where there are too few pixels to hold any out.
     pub(super) fn new(full: &Measurement, config: &HoldOut) -> Option<Self> {
         let stays = config.draw(full.y().dim());
-        let gram = full.operator().gram();
+        let (gram, least) = (full.operator().gram(), full.least_telling());
+        let telling = |gram: f32| gram > 0.0 && gram >= least;
         let count = |kept: bool| {
-            Zip::from(&stays).and(gram).fold(0u32, |n, &stays, &gram| n + u32::from(gram > 0.0 && stays == kept))
+            Zip::from(&stays).and(gram).fold(0u32, |n, &stays, &gram| n + u32::from(telling(gram) && stays == kept))
         };
         let (held, used) = (count(false), count(true));
         if held == 0 || used == 0 {
@@ -180,7 +181,7 @@ impl HeldOut {
         let given = full.restricted(stays.view()).ok()?;
         let frames = full.shape().frames as f32;
         let weight = Zip::from(&stays).and(gram).map_collect(|&stays, &gram| match stays {
-            _ if gram <= 0.0 => 0.0,
+            _ if !telling(gram) => 0.0,
             true => 1.0 / (gram * frames * used as f32),
             false => 1.0 / (gram * held as f32),
         });
@@ -365,6 +366,22 @@ mod tests {
         let predicted = pixels.error(noisy.view());
         // 1 + 1/T of the mean square error: at the pixels that the data step sees, nothing has been projected here.
         assert!((predicted / 0.0125 - 1.0).abs() < 0.15, "{predicted}");
+    }
+
+    /// Masks of gray glass: where only the glass is open, y is noise.
+    #[test]
+    fn nearly_closed_pixels_do_not_predict() {
+        let shape = VideoShape { frames: 4, height: 64, width: 64 };
+        let masks = MaskStack::random(shape, 0.5, 1).unwrap().view().mapv(|c| c.max(0.005));
+        let h = Arc::new(MaskOperator::new(MaskStack::new(masks).unwrap()));
+        let truth = moving_square(shape);
+        let y = h.forward(truth.view())
+            + sci_forward::testing::gaussian((1, 64, 64), 5).index_axis(Axis(0), 0).mapv(|n| 0.04 * n);
+        let full = Measurement::new(h, y).unwrap();
+        let pixels = HeldOut::new(&full, &HoldOut { spacing: 4, ..HoldOut::default() }).unwrap();
+        let predicted = pixels.error(truth.view());
+        // The noise over the light of an open pixel, which is about 2.
+        assert!(predicted < 3.0 * 0.04 * 0.04, "{predicted}");
     }
 
     /// A better iterate takes the place of the best whole: at the sensor and in RGB.

@@ -228,6 +228,7 @@ impl<'r> Loop<'r> {
     /// After a divergence: whether the solver goes on, from the best iterate. It may once.
     fn back_off(&mut self, solver: &mut dyn Solver, iteration: usize) -> bool {
         self.relative_residual = self.guard.restore_best(&mut self.current);
+        self.progress = progress(self.measurement, self.current.sensor.view(), self.current.sensor.view());
         if self.backed_off.is_some() {
             return false;
         }
@@ -243,9 +244,11 @@ impl<'r> Loop<'r> {
         let ended = matches!(stop, StopReason::ScheduleDone | StopReason::Converged);
         if let Some(best) = self.judge.take().and_then(Judge::into_best) {
             let progress = progress(whole, best.sensor.view(), best.sensor.view());
-            self.relative_residual = relative(progress, whole).0;
-            self.current = best;
-            if !self.guard.is_result(self.relative_residual, progress) {
+            let residual = relative(progress, whole).0;
+            if self.guard.is_result(residual, progress) {
+                (self.current, self.relative_residual) = (best, residual);
+            } else {
+                self.relative_residual = self.guard.restore_best(&mut self.current);
                 stop = StopReason::Diverged;
             }
         } else if ended && !self.guard.is_result(self.relative_residual, self.progress) {

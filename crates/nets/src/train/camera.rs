@@ -27,9 +27,9 @@ pub(super) fn measure(
     rng: &mut impl Rng,
 ) -> Result<Measurement> {
     let (seen, cfa) = seen(clip, pattern);
-    let masks = masks(seen.dim(), settings, rng);
-    let mut y = (&masks * &seen).sum_axis(Axis(0));
-    let told = if rng.random::<f64>() < settings.mask_errors { mistold(&masks, rng) } else { masks };
+    let Masks { shown, told } = masks(seen.dim(), settings, rng);
+    let mut y = (shown.as_ref().unwrap_or(&told) * &seen).sum_axis(Axis(0));
+    let told = if rng.random::<f64>() < settings.mask_errors { mistold(&told, rng) } else { told };
     add_noise(&mut y, settings, rng);
     let mut kept = Array2::from_shape_simple_fn(y.dim(), || true);
     if settings.holes > 0.0 {
@@ -84,33 +84,51 @@ fn symmetric(limit: f32, rng: &mut impl Rng) -> f32 {
 
 type Dim = (usize, usize, usize);
 
-fn masks(dim: Dim, settings: &CameraConfig, rng: &mut impl Rng) -> Array3<f32> {
+/// Masks as they are told, and as they are where that differs.
+struct Masks {
+    shown: Option<Array3<f32>>,
+    told: Array3<f32>,
+}
+
+fn masks(dim: Dim, settings: &CameraConfig, rng: &mut impl Rng) -> Masks {
     let [thin, dense] = settings.density;
     let density = thin + (dense - thin) * rng.random::<f64>();
-    match settings.masks[rng.random_range(0..settings.masks.len())] {
+    let told = match settings.masks[rng.random_range(0..settings.masks.len())] {
         MaskKind::Random => random(dim, density, rng),
-        MaskKind::Shifting => shifting(dim, density, rng),
+        MaskKind::Shifting => return shifting(dim, density, settings.mask_grain, rng),
         MaskKind::Blocky => blocky(dim, density, rng),
         MaskKind::Hadamard => hadamard(dim, rng),
         MaskKind::Gray => gray(dim, rng),
-    }
+    };
+    Masks { shown: None, told }
 }
 
 pub(super) fn random(dim: Dim, density: f64, rng: &mut impl Rng) -> Array3<f32> {
     Array3::from_shape_simple_fn(dim, || if rng.random::<f64>() < density { 1.0 } else { 0.0 })
 }
 
-/// One pattern that moves by whole pixels from frame to frame, mostly by one.
-fn shifting((frames, height, width): Dim, density: f64, rng: &mut impl Rng) -> Array3<f32> {
+/// One pattern that moves by whole pixels from frame to frame, mostly by one; its grain, which is not told, moves with it.
+fn shifting((frames, height, width): Dim, density: f64, most_grain: f32, rng: &mut impl Rng) -> Masks {
     let step = if rng.random::<f64>() < 0.7 { 1 } else { rng.random_range(2..=3) };
     let [down, across] = [(1, 0), (0, 1), (1, 1)][rng.random_range(0..3)].into();
     let [down, across]: [usize; 2] = [down * step, across * step];
     let pattern = random((1, height + down * (frames - 1), width + across * (frames - 1)), density, rng);
     let backwards = rng.random::<bool>();
-    Array3::from_shape_fn((frames, height, width), |(t, y, x)| {
-        let t = if backwards { frames - 1 - t } else { t };
-        pattern[[0, y + down * t, x + across * t]]
-    })
+    let moved = |pattern: &Array3<f32>| {
+        Array3::from_shape_fn((frames, height, width), |(t, y, x)| {
+            let t = if backwards { frames - 1 - t } else { t };
+            pattern[[0, y + down * t, x + across * t]]
+        })
+    };
+    let shown = (most_grain > 0.0).then(|| moved(&(&pattern * &grain(pattern.dim(), most_grain, rng))));
+    Masks { shown, told: moved(&pattern) }
+}
+
+/// Factors around 1, alike in neighbouring pixels, of a standard deviation up to `most`.
+fn grain(dim: Dim, most: f32, rng: &mut impl Rng) -> Array3<f32> {
+    let sigma = most * rng.random::<f32>();
+    // The mean of four has half of their standard deviation.
+    blurred(&Array3::from_shape_simple_fn(dim, || 1.0 + 2.0 * sigma * normal(rng))).mapv_into(|c| c.max(0.0))
 }
 
 /// Squares of two to four pixels that are open or shut together.
@@ -213,6 +231,7 @@ mod tests {
             holes: 0.05,
             saturated: 0.5,
             mask_errors: 0.5,
+            mask_grain: 0.1,
         }
     }
 
@@ -221,29 +240,34 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         for kind in MaskKind::ALL {
             let settings = CameraConfig { masks: vec![kind], density: [0.5, 0.5], ..settings() };
-            let masks = masks((8, 32, 40), &settings, &mut rng);
-            let mean = masks.mean().unwrap();
+            let told = masks((8, 32, 40), &settings, &mut rng).told;
+            let mean = told.mean().unwrap();
             assert!((0.4..0.6).contains(&mean), "{kind:?}: {mean}");
-            assert!(masks.iter().all(|c| (0.0..=1.2).contains(c)), "{kind:?}");
+            assert!(told.iter().all(|c| (0.0..=1.2).contains(c)), "{kind:?}");
         }
     }
 
     #[test]
-    fn a_shifting_mask_is_one_pattern_that_moves() {
-        let masks = shifting(DIM, 0.5, &mut ChaCha8Rng::seed_from_u64(3));
+    fn a_shifting_mask_and_its_grain_are_one_pattern_that_moves() {
+        let Masks { shown, told } = shifting(DIM, 0.5, 0.1, &mut ChaCha8Rng::seed_from_u64(3));
+        let shown = shown.unwrap();
+        assert_ne!(shown, told);
         let moved = |dy: usize, dx: usize, a: ArrayView3<'_, f32>, b: ArrayView3<'_, f32>| {
             let (_, h, w) = DIM;
             a.slice(s![.., dy.., dx..]) == b.slice(s![.., ..h - dy, ..w - dx])
         };
-        let (a, b) = (masks.slice(s![..5, .., ..]), masks.slice(s![1.., .., ..]));
-        let steps = (0..4).flat_map(|dy| (0..4).map(move |dx| (dy, dx)));
-        assert!(steps.into_iter().any(|(dy, dx)| moved(dy, dx, a, b) || moved(dy, dx, b, a)));
+        for masks in [shown, told] {
+            let (a, b) = (masks.slice(s![..5, .., ..]), masks.slice(s![1.., .., ..]));
+            let mut steps = (0..4).flat_map(|dy| (0..4).map(move |dx| (dy, dx)));
+            assert!(steps.any(|(dy, dx)| moved(dy, dx, a, b) || moved(dy, dx, b, a)));
+        }
     }
 
     #[test]
     fn a_measurement_is_that_of_the_clip_where_it_was_measured() {
         let clip = Array4::from_shape_fn((6, 3, 16, 8), |(t, c, y, x)| ((t + 2 * c + y + x) % 7) as f32 / 7.0);
-        let exact = CameraConfig { noise: 0.0, saturated: 0.0, mask_errors: 0.0, holes: 0.5, ..settings() };
+        let exact =
+            CameraConfig { noise: 0.0, saturated: 0.0, mask_errors: 0.0, mask_grain: 0.0, holes: 0.5, ..settings() };
         for (seed, pattern) in (0..).zip(CfaPattern::ALL) {
             let measurement = measure(clip.view(), pattern, &exact, &mut ChaCha8Rng::seed_from_u64(seed)).unwrap();
             let explained = measurement.operator().forward(seen(clip.view(), pattern).0.view());
@@ -255,7 +279,8 @@ mod tests {
     #[test]
     fn every_fault_changes_the_measurement() {
         let clip = Array4::from_shape_fn((6, 1, 16, 8), |(t, _, y, x)| ((t + y + x) % 7) as f32 / 7.0);
-        let none = CameraConfig { noise: 0.0, saturated: 0.0, mask_errors: 0.0, holes: 0.0, ..settings() };
+        let exact = CameraConfig { noise: 0.0, saturated: 0.0, mask_errors: 0.0, mask_grain: 0.0, ..settings() };
+        let none = CameraConfig { holes: 0.0, masks: vec![MaskKind::Shifting], ..exact };
         let error = |camera: &CameraConfig| {
             let rng = &mut ChaCha8Rng::seed_from_u64(5);
             let measurement = measure(clip.view(), CfaPattern::Rggb, camera, rng).unwrap();
@@ -264,6 +289,7 @@ mod tests {
         };
         assert!(error(&none) < 1e-6);
         assert!(error(&CameraConfig { noise: 50.0, noisy: 1.0, ..none.clone() }) > 0.1);
-        assert!(error(&CameraConfig { mask_errors: 1.0, ..none }) > 0.1);
+        assert!(error(&CameraConfig { mask_errors: 1.0, ..none.clone() }) > 0.1);
+        assert!(error(&CameraConfig { mask_grain: 0.2, ..none }) > 0.1);
     }
 }

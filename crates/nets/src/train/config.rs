@@ -279,6 +279,10 @@ pub struct CameraConfig {
     /// Share of the clips whose masks are told with errors of up to 0.3 pixels, 3 % of gain and a pedestal of 1 %. Default 0.
     #[serde(default)]
     pub mask_errors: f64,
+    /// Largest standard deviation of the factors, alike in neighbouring pixels, by which a shifting mask differs from what is told of it;
+    /// drawn for each clip from 0 to this, 0 to 0.5. They move with the mask, as dust and uneven prints do. Default 0.
+    #[serde(default)]
+    pub mask_grain: f32,
 }
 
 /// How masks look.
@@ -461,7 +465,7 @@ impl TrainConfig {
 
     fn validate_camera(&self, camera: &CameraConfig) -> Result<()> {
         let CameraConfig { frames: [few, many], density: [thin, dense], masks, noise, .. } = camera;
-        let CameraConfig { noisy, holes, saturated, mask_errors, .. } = camera;
+        let CameraConfig { noisy, holes, saturated, mask_errors, mask_grain, .. } = camera;
         let frames = self.data.frames == 1 || self.noise.is_some();
         check(frames, "data.frames", self.data.frames, "left out without [noise]: camera.frames says how many")?;
         let frames = (1..=64).contains(few) && (*few..=64).contains(many);
@@ -474,6 +478,7 @@ impl TrainConfig {
         check((0.0..=0.5).contains(holes), "camera.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(saturated), "camera.saturated", saturated, "0 to 1")?;
         check((0.0..=1.0).contains(mask_errors), "camera.mask_errors", mask_errors, "0 to 1")?;
+        check((0.0..=0.5).contains(mask_grain), "camera.mask_grain", mask_grain, "0 to 0.5")?;
         check((0.0..=1.0).contains(noisy), "camera.noisy", noisy, "0 to 1")
     }
 

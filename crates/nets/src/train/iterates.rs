@@ -118,6 +118,7 @@ mod tests {
             holes: 0.1,
             saturated: 0.0,
             mask_errors: 0.0,
+            mask_grain: 0.0,
         };
         for channels in [1, 3] {
             let clip =

@@ -55,7 +55,7 @@ impl Kind {
             Self::Random => MaskStack::random(shape, density, seed)?,
             Self::Shifting => MaskStack::shifting(shape, density, seed)?,
         };
-        Ok(if signed { masks.differential() } else { masks })
+        Ok(if signed { masks.differential()? } else { masks })
     }
 }
 

@@ -285,10 +285,10 @@ fn masks(
 ) -> anyhow::Result<sci_forward::MaskStack> {
     use sci_forward::MaskStack;
     let shape = |frames| VideoShape { frames, height, width };
-    let of = |r: &RandomMask, masks: MaskStack| if r.signed { masks.differential() } else { masks };
+    let of = |r: &RandomMask, masks: MaskStack| if r.signed { masks.differential() } else { Ok(masks) };
     Ok(match &s.mask {
-        MaskSource::Random(r) => of(r, MaskStack::random(shape(r.frames), r.density, r.seed)?),
-        MaskSource::Shifting(r) => of(r, MaskStack::shifting(shape(r.frames), r.density, r.seed)?),
+        MaskSource::Random(r) => of(r, MaskStack::random(shape(r.frames), r.density, r.seed)?)?,
+        MaskSource::Shifting(r) => of(r, MaskStack::shifting(shape(r.frames), r.density, r.seed)?)?,
         MaskSource::File(path) => {
             let (masks, said) = scene::read_mask(path, reading)?;
             notes.extend(said);

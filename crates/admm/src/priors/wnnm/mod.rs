@@ -114,6 +114,8 @@ struct Matched {
     groups: Arc<Groups>,
     /// In which iteration.
     iteration: usize,
+    /// The iteration of the last call that used them.
+    last: usize,
 }
 
 impl std::fmt::Debug for Matched {
@@ -130,15 +132,17 @@ impl Wnnm {
 
     /// The groups of this call: those that were found before, or others.
     fn groups(&mut self, call: &Call<'_>, grid: Grid, noisy: ArrayView4<'_, f32>) -> Arc<Groups> {
-        let current = |matched: &Matched| {
-            let calls = call.iteration.checked_sub(matched.iteration);
-            calls.is_some_and(|calls| (1..self.params.match_every).contains(&calls)) && matched.groups.grid == grid
+        // A video goes on with the next iteration; another run, or another part of the video, does not.
+        let goes_on = |matched: &&mut Matched| {
+            let recent = call.iteration < matched.iteration.saturating_add(self.params.match_every);
+            recent && call.iteration == matched.last + 1 && matched.groups.grid == grid
         };
-        if let Some(matched) = self.matched.as_ref().filter(|matched| current(matched)) {
+        if let Some(matched) = self.matched.as_mut().filter(goes_on) {
+            matched.last = call.iteration;
             return Arc::clone(&matched.groups);
         }
-        let groups = Arc::new(Groups::new(grid, self.params, noisy));
-        self.matched = Some(Matched { groups: Arc::clone(&groups), iteration: call.iteration });
+        let (groups, iteration) = (Arc::new(Groups::new(grid, self.params, noisy)), call.iteration);
+        self.matched = Some(Matched { groups: Arc::clone(&groups), iteration, last: iteration });
         groups
     }
 }
@@ -179,7 +183,7 @@ fn shrunk(groups: &Groups, plane: &[f32], sigma: f32, weight: f32) -> Array3<f32
     let (pixels, waves) = (side * side, shrink::waves(side));
     let mut sums = Array3::<f32>::zeros((frames, height, width));
     let of_all = (0..groups.len()).collect::<Vec<_>>();
-    let at_once = (AT_ONCE / (pixels * groups.group(0).len())).next_multiple_of(shrink::AT_ONCE);
+    let at_once = (AT_ONCE / (pixels * groups.group(0).len())).max(1).next_multiple_of(shrink::AT_ONCE);
     for some in of_all.chunks(at_once) {
         let shrink = |shrinker: &mut Shrinker<'_>, some: &[usize]| {
             let members: Vec<&[u32]> = some.iter().map(|&index| groups.group(index)).collect();
