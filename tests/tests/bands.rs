@@ -122,6 +122,52 @@ fn a_run_that_is_killed_goes_on_with_the_next_band() {
     assert_same(&bench.path("out"), &bench.path("whole"));
 }
 
+/// It stops in its second measurement, and the pictures of the first are not there, as if it had stopped between the two.
+#[test]
+fn pictures_that_a_stopped_run_did_not_make_are_made() {
+    let bench = Bench::new();
+    let both = ndarray::concatenate(Axis(0), &[video().view(), video().view()]).unwrap();
+    let mut npz = NpzWriter::new(fs::File::create(bench.path("scene.npz")).unwrap());
+    npz.add_array("mask", &masks()).unwrap();
+    npz.add_array("orig", &both).unwrap();
+    npz.finish().unwrap();
+    bench.write("a.toml", CONFIG);
+    let arguments = ["run", "a.toml", "--out", "out", "--set", BANDS, "--set", "stage.0.iterations=30"];
+    let mut child = bench.command(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    wait_for(&bench.path("out/.sci-run/m01.bands"));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    fs::remove_dir_all(bench.path("out/.sci-run/m00/pictures")).unwrap();
+    let resumed = bench.sci(&[&arguments[..], &["--resume"]].concat());
+    assert_eq!(resumed.code, 0, "{}{}", resumed.stdout, resumed.stderr);
+    assert!(bench.path("out/frames/m00_t07.png").is_file() && bench.path("out/report.html").is_file());
+}
+
+/// Masks and measurements, each alone in a `.npy` file.
+#[test]
+fn measurements_and_masks_may_lie_in_files_without_names() {
+    let bench = Bench::new();
+    let y = (masks().mapv(u16::from) * video().mapv(u16::from)).sum_axis(Axis(0)).mapv(f32::from) / 255.0;
+    masks().write_npy(fs::File::create(bench.path("coded.npy")).unwrap()).unwrap();
+    y.write_npy(fs::File::create(bench.path("shots.npy")).unwrap()).unwrap();
+    bench.write("a.toml", CONFIG);
+    let of = ["--set", "data.path=shots.npy", "--set", "data.mask=coded.npy", "--set", "output=minimal"];
+    works(&bench, &[&["--out", "whole"], &of[..]].concat());
+    works(&bench, &[&["--out", "bands", "--set", BANDS], &of[..]].concat());
+    assert!(bench.record("bands")["measurements"][0]["bands"].as_u64() > Some(1));
+    assert!(difference(&bench, "whole", "bands") < 1e-4);
+}
+
+/// A mosaic is no picture: the page is without it.
+#[test]
+fn a_color_scene_may_have_a_mosaic_for_its_truth() {
+    let bench = bench();
+    works(&bench, &["--out", "out", "--set", "data.cfa=rggb", "--set", "memory=\"200 MB\""]);
+    let record = bench.record("out");
+    assert!(record["measurements"][0]["bands"].as_u64() > Some(1));
+    assert!(record["measurements"][0]["psnr_db"].as_f64().is_some());
+}
+
 #[test]
 fn a_color_scene_has_what_the_middle_of_its_bands_would_have_alone() {
     let bench = Bench::new();

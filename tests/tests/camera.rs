@@ -62,6 +62,9 @@ fn masks_that_sit_elsewhere_are_found_and_used() {
     let found = bench.sci(&args);
     assert_eq!(found.code, 0, "{}", found.stderr);
     assert_eq!(fs::read_dir(bench.path("cal")).unwrap().count(), 3);
+    // Its masks.npy would be in the place of what it reads.
+    let onto = bench.sci(&["calibrate", "a.toml", "--set", wrong, "--out", "."]);
+    assert!(onto.code == 2 && onto.stderr.contains("it holds an input"), "{}", onto.stderr);
     let calibration: Value = serde_json::from_slice(&fs::read(bench.path("cal/calibration.json")).unwrap()).unwrap();
     let (by_file, record) = run(&bench, &[wrong, "data.calibration=cal/calibration.json"]);
     assert_eq!(record["calibration"], calibration);

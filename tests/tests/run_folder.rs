@@ -167,6 +167,13 @@ fn a_stopped_run_is_neither_thrown_away_nor_continued_by_another() {
     let again = ok(&bench, &[&same[..], &["--resume"]].concat());
     assert!(again.stdout.contains("nothing is unfinished"), "{}", again.stdout);
     refused(&bench, &other, &["nothing is unfinished", "stage.0.iterations"]);
+    // Other masks of the same size are another run, for a stopped and for a finished one.
+    stopped(&bench, "masks");
+    let mask = Array3::from_shape_fn((4, 64, 64), |(t, y, x)| ((t * 5 + y * 7 + x) % 4 < 2) as u8 as f32);
+    bench.write("scene/mask.npy", npy(&mask));
+    let of_masks = ["--out", "masks", "--set", "stage.0.iterations=400", "--resume"];
+    refused(&bench, &of_masks, &["another one", "checksums.files"]);
+    refused(&bench, &[&same[..], &["--resume"]].concat(), &["nothing is unfinished", "checksums.files"]);
     stopped(&bench, "new");
     let anew = ok(&bench, &["--out", "new", "--restart"]);
     assert!(anew.stdout.contains("measurement  0"), "{}", anew.stdout);

@@ -182,10 +182,12 @@ impl<'e> Factory<'e> {
 
     /// The plan, without the stages of a network that is better not to take over from the one that learned.
     fn plan_as_learned(&self) -> Plan {
-        let mut plan = self.plan.clone();
-        let learner = self.experiment.stages[0].denoiser;
-        for (stage, own) in plan.stages.iter_mut().zip(&self.experiment.stages) {
-            if self.ends_early && own.denoiser != learner {
+        let (mut plan, denoisers) = (self.plan.clone(), &self.experiment.denoisers);
+        // TV may go before it, which learns nothing.
+        let mut stages = plan.stages.iter_mut().zip(&self.experiment.stages);
+        let learner = stages.find(|(_, own)| denoisers[own.denoiser].part.adapts()).map(|(_, own)| own.denoiser);
+        for (stage, own) in stages {
+            if self.ends_early && Some(own.denoiser) != learner {
                 stage.iterations = 0;
             }
         }

@@ -116,7 +116,7 @@ impl Studio<'_> {
         shape: [usize; 4],
     ) -> anyhow::Result<()> {
         let (index, path) = (finished.record.index, finished.video());
-        if !output.has_pictures() {
+        if !output.has_pictures() || finished.pictures().exists() {
             return Ok(());
         }
         finished.make_pictures(|dir| {
@@ -133,8 +133,11 @@ impl Studio<'_> {
                 {
                     let whole = whole.seen(scene.cfa);
                     let shown = whole.1.unwrap_or_else(|| whole.0.insert_axis(Axis(1)));
-                    psnr_db.push(report::pictures::psnr(shown.index_axis(Axis(0), 0), frame.view()));
-                    truth.push(frames::shrunk(shown.view(), PAGE_SIDE));
+                    // Of a mosaic there is no picture to compare with.
+                    if shown.len_of(Axis(1)) == frame.len_of(Axis(0)) {
+                        psnr_db.push(report::pictures::psnr(shown.index_axis(Axis(0), 0), frame.view()));
+                        truth.push(frames::shrunk(shown.view(), PAGE_SIDE));
+                    }
                 }
                 small.push(frames::shrunk(frame.insert_axis(Axis(0)).view(), PAGE_SIDE));
             }

@@ -61,6 +61,9 @@ pub struct Record {
     /// How the masks were found to sit, if that was looked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<crate::calibration::Calibration>,
+    /// Of the measurements, and of the files that it read: another run with these has other results. Null in records of before.
+    #[serde(default)]
+    pub checksums: serde_json::Value,
     /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
     /// what it `extends` and the `--set`s.
     pub config: serde_json::Value,

@@ -141,6 +141,7 @@ pub fn record(
         shards: Vec::new(),
         files,
         calibration,
+        checksums: serde_json::Value::Null,
         config: experiment.record_json(),
     })
 }

@@ -1,7 +1,7 @@
 //! Denoisers: the program's for loops in Python, and any callable of Python for the program's loops.
 
 use std::path::Path;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
 use admm::{BoxError, Call};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, Ix4, IxDyn};
@@ -85,7 +85,7 @@ impl Denoiser {
         let clean = py.detach(|| {
             let mut clean = Array4::zeros(x.dim());
             let call = Call { sigma, iteration, ..Call::default() };
-            let (mut built, mut saving) = (self.lock(), Saving::default());
+            let (mut built, mut saving) = (self.lock()?, Saving::default());
             built.on_frames(&mut saving).denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
             anyhow::Ok(clean)
         });
@@ -132,10 +132,18 @@ impl Denoiser {
         }
     }
 
-    /// One call at a time.
-    fn lock(&self) -> MutexGuard<'_, Box<dyn Built>> {
-        // What a panic left is overwritten by the next call.
-        self.built.lock().unwrap_or_else(PoisonError::into_inner)
+    /// One call at a time. A solve has it until its end: a callback that waited for it would wait for ever.
+    fn lock(&self) -> anyhow::Result<MutexGuard<'_, Box<dyn Built>>> {
+        match self.built.try_lock() {
+            Ok(built) => Ok(built),
+            // What a panic left is overwritten by the next call.
+            Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
+            Err(TryLockError::WouldBlock) => {
+                anyhow::bail!(
+                    "this sci.Denoiser is at work in a solve or in another thread; make another one of the same settings"
+                )
+            }
+        }
     }
 }
 
@@ -181,7 +189,7 @@ impl Plugged {
     ) -> anyhow::Result<T> {
         match self {
             Self::Ours(ours) => {
-                let mut built = ours.get().lock();
+                let mut built = ours.get().lock()?;
                 let mut saving = Saving::default();
                 let mut denoiser = built.on_frames(&mut saving);
                 solve(denoiser.as_mut())

@@ -193,13 +193,13 @@ pub(crate) fn simulate<'py>(
     let (cfa, masks) = (pattern(cfa)?, mask_stack(masks)?);
     let x = array::<IxDyn>("video", video, AXES)?;
     let x = row_major(x.as_array()).into_owned();
+    let shape = x.shape().to_vec();
     let truth = match (x.ndim(), cfa) {
         (3, _) => x.into_dimensionality().ok().map(Truth::Sensor),
         (4, Some(_)) if x.len_of(Axis(1)) == 3 => x.into_dimensionality().ok().map(Truth::Rgb),
         _ => None,
     };
-    let truth =
-        truth.ok_or_else(|| refused(format!("`video` has shape {:?}, expected {AXES}", video.getattr("shape"))))?;
+    let truth = truth.ok_or_else(|| refused(format!("`video` has shape {shape:?}, expected {AXES}")))?;
     let noise = Noise::new(photons, sigma).map_err(|e| raised(e.into()))?;
     let (optics, readout) = of_arguments(&settings::arguments(camera)?, noise).map_err(|e| raised(e.into()))?;
     let camera = Camera { optics, readout, seed };

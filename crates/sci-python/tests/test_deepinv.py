@@ -77,7 +77,7 @@ def test_mistakes():
     with pytest.raises(ValueError, match="legal"):
         VideoSCI(torch.ones(2, 3, 3), channels="frames")
     with pytest.raises(ValueError, match="finite"):
-        VideoSCI(-torch.ones(2, 3, 3))
+        VideoSCI(torch.full((2, 3, 3), float("nan")))
 
 
 def test_dpir_of_deepinv_on_traffic(traffic):

@@ -238,7 +238,7 @@ impl<'s> Search<'s> {
         let Axis { get, step, range: (least, most), .. } = self.axes[axis];
         let (at, middle) = (get(&self.best), self.best_errors);
         // The least error of a range that lies at its end may lie anywhere beyond.
-        if (at <= least || at >= most) && at != get(&self.told) {
+        if (at <= least || at >= most) && at != get(&self.told) && self.falls_beyond(axis)? {
             return Ok(f64::INFINITY);
         }
         let (below, above) = (self.errors(&self.with(axis, at - step))?, self.errors(&self.with(axis, at + step))?);
@@ -252,6 +252,20 @@ impl<'s> Search<'s> {
         let mean = slopes.iter().sum::<f64>() / GROUPS as f64;
         let variance = slopes.iter().map(|slope| (slope - mean).powi(2)).sum::<f64>() / (GROUPS - 1) as f64;
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
+    }
+
+    /// Whether the error would go on falling beyond the end of the range at which the best value is, as far as a parabola tells.
+    fn falls_beyond(&mut self, axis: usize) -> Result<bool, CalibrateError> {
+        let Axis { get, step, range: (_, most), .. } = self.axes[axis];
+        let (at, short) = (get(&self.best), 0.2 * step);
+        let inward = if at >= most { -short } else { short };
+        let [near, far] = [1.0, 2.0].map(|steps| at + steps * inward);
+        let points = [
+            (at, self.best_errors.total()),
+            (near, self.errors(&self.with(axis, near))?.total()),
+            (far, self.errors(&self.with(axis, far))?.total()),
+        ];
+        Ok(vertex(points).is_none_or(|lowest| (lowest - at) * inward < -0.5 * short * short))
     }
 
     /// Black level and contrast as nearly closed pixels tell them, or, where these are too few, all. A scene may imitate some of either: held-out pixels

@@ -12,6 +12,7 @@ use super::{Done, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
+use crate::run_folder::refuse_inputs;
 
 /// Arguments of `sci calibrate`.
 ///
@@ -45,6 +46,7 @@ impl Args {
         experiment.data.reading.masks_off = 1;
         let default = || Path::new("runs").join(format!("{}-calibration", experiment.name));
         let out = self.out.clone().unwrap_or_else(default);
+        refuse_inputs(&out, &experiment.inputs())?;
         check_folder(&out)?;
         catch_interrupts()?;
         let (mut scene, chosen) = scene_and_choice(&experiment)?;

@@ -146,8 +146,18 @@ fn scene_of(record: &Record) -> anyhow::Result<Scene> {
     let written = &record.config["written"];
     let mut written = Written::deserialize(written).context("the record does not hold the experiment's text")?;
     // Where it was found then; the current folder may be another one now.
-    let found = record.config["data"]["path"].as_str().context("the record names no data")?;
-    written.set.push(format!("data.path={}", toml::Value::from(found)));
+    let data = &record.config["data"];
+    data["path"].as_str().context("the record names no data")?;
+    let files = [
+        ("data.path", &data["path"]),
+        ("data.mask", &data["mask"]),
+        ("data.calibration", &data["calibration"]),
+        ("data.sensor.dark", &data["sensor"]["dark"]),
+        ("data.sensor.white", &data["sensor"]["white"]),
+    ];
+    let found =
+        files.into_iter().filter_map(|(key, path)| Some((key, path.as_str().filter(|p| Path::new(p).is_absolute())?)));
+    written.set.extend(found.map(|(key, path)| format!("{key}={}", toml::Value::from(path))));
     let experiment = load_written(&written)?;
     super::run::read_scene(&experiment)
 }

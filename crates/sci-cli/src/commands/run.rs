@@ -5,6 +5,8 @@ mod finishing;
 mod solving;
 mod subject;
 
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -103,6 +105,7 @@ impl Args {
             out: &out,
             begin,
             calibration,
+            checksums: plan.identity["checksums"].clone(),
             count: own.len(),
         };
         let done = solved.and_then(|()| match shard {
@@ -227,12 +230,48 @@ fn solve(
     studio.in_step(&before, |show| solving::solve_all(experiment, scene, own, factory, folder, show))
 }
 
+/// Of all files that it reads: masks, weights, a calibration, dark and white frames; of the data where it was read as a whole.
+fn checksum_of_files(experiment: &Experiment, subject: &Subject) -> anyhow::Result<u32> {
+    let mut sum = crc32fast::Hasher::new();
+    let cut = matches!(subject, Subject::Cut(_));
+    for (key, path) in experiment.inputs().into_iter().filter(|(key, _)| !(cut && *key == "data.path")) {
+        add_files(path, &mut sum).with_context(|| format!("{key}: {}", path.display()))?;
+    }
+    Ok(sum.finalize())
+}
+
+/// Adds the bytes of a file, or of all files of a folder.
+fn add_files(path: &Path, sum: &mut crc32fast::Hasher) -> std::io::Result<()> {
+    if path.is_dir() {
+        let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
+        files.sort();
+        return files.iter().filter(|file| file.is_file()).try_for_each(|file| add_files(file, sum));
+    }
+    // What is no file cannot be read twice.
+    if !path.is_file() {
+        return Ok(());
+    }
+    let mut file = BufReader::with_capacity(1 << 20, File::open(path)?);
+    loop {
+        let bytes = file.fill_buf()?;
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        sum.update(bytes);
+        let count = bytes.len();
+        file.consume(count);
+    }
+}
+
 /// Everything that the bits of a run depend on, but for the kernel.
 fn identity(experiment: &Experiment, subject: &Subject, chosen: &[usize]) -> anyhow::Result<serde_json::Value> {
     Ok(json!({
         "version": host::VERSION,
         "measurements": chosen,
-        "checksum of the data": format!("{:08x}", subject.checksum(chosen)?),
+        "checksums": {
+            "data": format!("{:08x}", subject.checksum(chosen)?),
+            "files": format!("{:08x}", checksum_of_files(experiment, subject)?),
+        },
         "config": experiment.to_json(),
     }))
 }

@@ -1,5 +1,6 @@
 //! `sci simulate`: a video to a scene file of masks, measurements and truth.
 
+use std::fs;
 use std::path::PathBuf;
 
 use ndarray::{Array2, Axis, s};
@@ -99,6 +100,12 @@ impl Args {
                 self.out.display()
             ))
             .into());
+        }
+        let inputs = [Some(&self.video), self.mask_file.as_ref()];
+        let same =
+            |input: &PathBuf| fs::canonicalize(input).ok().is_some_and(|i| fs::canonicalize(&self.out).ok() == Some(i));
+        if let Some(input) = inputs.into_iter().flatten().find(|input| same(input)) {
+            return Err(UsageError(format!("--out {}: it is the input {}", self.out.display(), input.display())).into());
         }
         let noise = Noise::new(self.photons, f64::from(self.sigma / 255.0))?;
         let (optics, readout) = of_arguments(&self.set, noise)?;

@@ -179,7 +179,11 @@ impl RunFolder {
         let complete = solved == plan.measurements && record.measurements.iter().all(|m| m.stop != Stop::Observer);
         let mut config = record.config;
         config.as_object_mut().map(|config| config.remove("written"));
-        let differences = compare(&config, &plan.identity["config"]);
+        let mut differences = compare(&config, &plan.identity["config"]);
+        if !record.checksums.is_null() {
+            let of = |checksums: &Value| serde_json::json!({ "checksums": checksums });
+            differences.extend(compare(&of(&record.checksums), &of(&plan.identity["checksums"])));
+        }
         if differences.is_empty() {
             return Ok(complete);
         }

@@ -10,7 +10,7 @@ class VideoSCI(LinearPhysics):
     :math:`A A^\top` is diagonal, :math:`\sum_t C_t^2`, so that pseudo-inverse and proximal step have a closed form. It is made of torch
     operations: it runs on the device of its masks and can be differentiated through.
 
-    :param masks: tensor or array `[T, H, W]`, transmittances, of a differential camera of both signs.
+    :param masks: tensor or array `[T, H, W]`, transmittances; of a differential camera of both signs.
     :param channels: `"time"`, the default: videos are `[batch, T, H, W]`, as image denoisers with T channels and `sci` have them;
         `"video"`: `[batch, 1, T, H, W]`, as deepinv's video models have them. Measurements are `[batch, 1, H, W]`.
     :param kwargs: those of `deepinv.physics.LinearPhysics`, such as `noise_model` and `device`.
@@ -22,8 +22,8 @@ class VideoSCI(LinearPhysics):
             raise ValueError(f"masks have shape {tuple(masks.shape)}, expected [T, H, W]")
         if channels not in ("time", "video"):
             raise ValueError(f"channels = {channels!r} is not legal; legal: 'time', 'video'")
-        if not bool((torch.isfinite(masks) & (masks >= 0)).all()):
-            raise ValueError("masks must be finite and at least 0")
+        if not bool(torch.isfinite(masks).all()):
+            raise ValueError("masks must be finite")
         self._time = 1 if channels == "time" else 2
         size = tuple(masks.shape)
         super().__init__(img_size=size if self._time == 1 else (1, *size), device=device, **kwargs)

@@ -40,6 +40,10 @@ impl Cut {
     ) -> anyhow::Result<()> {
         self.pass_solved(factory, folder)?;
         let limit = experiment.output.report_megabytes as usize * 1_000_000 / chosen.len().max(1);
+        // A run may have stopped between a result and its pictures.
+        for finished in folder.finished() {
+            Studio::make_by_frames(&experiment.output, limit, &self.scene, finished, self.shape())?;
+        }
         for &k in &own[folder.finished().len()..] {
             if !self.solve_bands(experiment, k, factory, folder)? {
                 break;

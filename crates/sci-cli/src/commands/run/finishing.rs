@@ -22,6 +22,8 @@ pub(super) struct Ending<'r> {
     pub(super) begin: Instant,
     /// How the masks were found to sit.
     pub(super) calibration: Option<Calibration>,
+    /// As in the record.
+    pub(super) checksums: serde_json::Value,
     /// How many measurements were to be solved here.
     pub(super) count: usize,
 }
@@ -76,6 +78,7 @@ impl Ending<'_> {
         let measurements: Vec<_> = folder.finished().iter().map(|f| f.record.clone()).collect();
         let indices: Vec<usize> = measurements.iter().map(|m| m.index).collect();
         let (files, calibration) = (self.layout.files(&indices), self.calibration.clone());
-        solve::record(self.experiment, self.factory, measurements, files, calibration, self.begin)
+        let record = solve::record(self.experiment, self.factory, measurements, files, calibration, self.begin)?;
+        Ok(Record { checksums: self.checksums.clone(), ..record })
     }
 }

@@ -73,7 +73,16 @@ impl Banded {
         let file = path.display().to_string();
         let Some(slab::Arrays { named, format }) = slab::arrays(path)? else { return Ok(None) };
         let listed: Vec<String> = named.iter().map(|(name, _)| name.clone()).collect();
-        let keys = names::resolved(&reading.keys, &listed);
+        let mut keys = names::resolved(&reading.keys, &listed);
+        // The only array of a file without names is the measurements, if masks have a file of their own.
+        if let ([only], Some(_), Format::Npy) = (listed.as_slice(), &reading.mask, format) {
+            keys.meas.clone_from(only);
+        }
+        // As in a scene that is read whole: a guess that is no video was none.
+        let is_video = |(_, stored): &(String, Stored)| stored.shape().iter().filter(|&&n| n > 1).count() >= 3;
+        if keys.orig != reading.keys.orig && !named.iter().any(|array| array.0 == keys.orig && is_video(array)) {
+            keys.orig.clone_from(&reading.keys.orig);
+        }
         let part_of = |named: &[(String, Stored)], key: &str, format: Format| {
             let Some((_, stored)) = named.iter().find(|(name, _)| name == key) else { return Ok(None) };
             let place = Place { file: &file, key, format, axes: reading.axes };
@@ -86,6 +95,10 @@ impl Banded {
             None => part_of(&named, &keys.mask, format)?,
             Some(path) => {
                 let Some(own) = slab::arrays(path)? else { return Ok(None) };
+                // What orders its axes in another way is put in order by reading it whole.
+                if (own.format == Format::Mat) != (format == Format::Mat) {
+                    return Ok(None);
+                }
                 let listed: Vec<String> = own.named.iter().map(|(name, _)| name.clone()).collect();
                 let found = names::resolved(&Keys { mask: reading.keys.mask.clone(), ..Keys::default() }, &listed);
                 let key = if own.named.len() == 1 { listed[0].clone() } else { found.mask };
@@ -259,7 +272,7 @@ impl Banded {
             Samples::Bytes(bytes) => sum.update(bytes),
             Samples::Floats(values) => sum.update(&values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()),
         };
-        for rows in self.strips().filter(|_| self.meas.is_none()) {
+        for rows in self.strips() {
             add(&self.mask.read(0..self.shape.frames, rows)?);
         }
         for &k in measurements {

@@ -70,7 +70,9 @@ impl Place<'_> {
     fn squeezed<'v, T>(&self, mut data: ArrayViewD<'v, T>, most: usize) -> ArrayViewD<'v, T> {
         while data.ndim() > most {
             let mut ones = (0..data.ndim()).filter(|&axis| data.len_of(Axis(axis)) == 1);
-            let outermost = if self.axes() == Axes::Thw { ones.next() } else { ones.next_back() };
+            // A last axis of one channel goes before a first one of one frame.
+            let channel = Some(data.ndim() - 1).filter(|&last| data.ndim() == 4 && data.len_of(Axis(last)) == 1);
+            let outermost = if self.axes() == Axes::Thw { channel.or_else(|| ones.next()) } else { ones.next_back() };
             match outermost {
                 Some(axis) => data = data.index_axis_move(Axis(axis), 0),
                 None => break,
