@@ -8,6 +8,7 @@
 mod adapters;
 mod calibrate;
 mod data_step;
+mod linear;
 mod priors;
 #[cfg(test)]
 mod reference;

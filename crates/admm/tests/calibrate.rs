@@ -102,7 +102,7 @@ fn a_shift_of_balanced_masks_of_both_signs_is_found() {
         if t < half { 2.0 * open - 1.0 } else { 1.0 - 2.0 * open }
     };
     let balanced = MaskStack::new(Array3::from_shape_fn(SHAPE.dim(), each)).unwrap();
-    assert!(SHAPE.frames % 2 == 0 && balanced.sum().iter().all(|&sum| sum == 0.0));
+    assert!(SHAPE.frames.is_multiple_of(2) && balanced.sum().iter().all(|&sum| sum == 0.0));
     assert_shift_is_found(&balanced, 0.1);
 }
 

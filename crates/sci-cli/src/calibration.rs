@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::io::defects::{Defect, LeftOut};
 use crate::io::read_file;
 use crate::io::scene::Scene;
+use crate::io::scene::field::median;
 
 /// The version of the file.
 const SCHEMA: u32 = 1;
@@ -95,12 +96,6 @@ pub fn find(
         measurements.iter().take(MOST_MEASUREMENTS).map(|&k| scene.y(k).to_owned()).collect();
     let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| watch(progress.solves, progress.expected));
     Ok(Calibration::of(found.context("calibration")?))
-}
-
-fn median(image: &Array2<f32>) -> f32 {
-    let mut values: Vec<f32> = image.iter().copied().collect();
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
 /// The masks of a scene, those at pixels that are left out with them.

@@ -1,6 +1,7 @@
 //! Detects static tiles from one measurement.
 
 use super::tiles::{Grid, SIDE};
+use crate::linear::Cholesky;
 use ndarray::parallel::prelude::*;
 use ndarray::{Array1, Array2, Array3};
 use sci_forward::Measurement;
@@ -116,36 +117,12 @@ impl Fit {
             return false;
         }
         let normal = &self.normal + scale;
-        let explained = solve(normal, &self.right).map_or(f64::INFINITY, |x| x.dot(&self.right));
+        let right = self.right.as_slice().expect("made so");
+        let solved = Cholesky::of(normal).map(|cholesky| cholesky.solve(right));
+        let explained = solved.map_or(f64::INFINITY, |x| x.iter().zip(right).map(|(x, right)| x * right).sum());
         let rest = (self.squares - explained).max(0.0) / (self.count - freedom) as f64;
         explained <= LARGEST_F * freedom as f64 * rest || self.squares <= 1e-8 * self.count as f64
     }
-}
-
-/// `a x = b` for a symmetric positive definite `a` by Cholesky's decomposition; nothing if it is not.
-fn solve(mut a: Array2<f64>, b: &Array1<f64>) -> Option<Array1<f64>> {
-    let n = b.len();
-    let mut x = b.clone();
-    for j in 0..n {
-        let pivot = a[[j, j]] - (0..j).map(|k| a[[j, k]] * a[[j, k]]).sum::<f64>();
-        if pivot <= 1e-9 * a[[j, j]].abs() {
-            return None;
-        }
-        a[[j, j]] = pivot.sqrt();
-        for i in j + 1..n {
-            let dot: f64 = (0..j).map(|k| a[[i, k]] * a[[j, k]]).sum();
-            a[[i, j]] = (a[[i, j]] - dot) / a[[j, j]];
-        }
-    }
-    for i in 0..n {
-        let dot: f64 = (0..i).map(|k| a[[i, k]] * x[k]).sum();
-        x[i] = (x[i] - dot) / a[[i, i]];
-    }
-    for i in (0..n).rev() {
-        let dot: f64 = (i + 1..n).map(|k| a[[k, i]] * x[k]).sum();
-        x[i] = (x[i] - dot) / a[[i, i]];
-    }
-    Some(x)
 }
 
 /// Sums of a correlation.

@@ -6,6 +6,7 @@
 //! frame that is brighter explains as much.
 
 use super::{TILES, squares_of, tile_of};
+use crate::linear::Cholesky;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use sci_forward::{MaskError, MaskStack, brightness};
 
@@ -219,37 +220,6 @@ fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, whole: &Array2<bool>, open: &
         }
     }
     pixels
-}
-
-/// The lower triangle L of `A = L Lᵀ`.
-struct Cholesky(Array2<f64>);
-
-impl Cholesky {
-    /// Of a matrix of which the lower triangle is read; nothing if it is not positive definite.
-    fn of(mut a: Array2<f64>) -> Option<Self> {
-        for i in 0..a.nrows() {
-            for j in 0..=i {
-                let known: f64 = (0..j).map(|k| a[[i, k]] * a[[j, k]]).sum();
-                let left = a[[i, j]] - known;
-                a[[i, j]] = if i == j { Some(left.sqrt()).filter(|root| *root > 0.0)? } else { left / a[[j, j]] };
-            }
-        }
-        Some(Self(a))
-    }
-
-    fn solve(&self, right: &[f64]) -> Vec<f64> {
-        let (l, n) = (&self.0, right.len());
-        let mut x = right.to_vec();
-        for i in 0..n {
-            let known: f64 = (0..i).map(|k| l[[i, k]] * x[k]).sum();
-            x[i] = (x[i] - known) / l[[i, i]];
-        }
-        for i in (0..n).rev() {
-            let known: f64 = (i + 1..n).map(|k| l[[k, i]] * x[k]).sum();
-            x[i] = (x[i] - known) / l[[i, i]];
-        }
-        x
-    }
 }
 
 #[cfg(test)]

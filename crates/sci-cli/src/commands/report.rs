@@ -14,10 +14,7 @@ use crate::io::scene::{self, Keys, Reading, Scene};
 use crate::record::Record;
 use crate::report;
 use crate::report::pictures::{MeasurementImages, Pictures};
-use crate::run_folder::RECORD;
-
-/// The file of a run's page.
-const PAGE: &str = "report.html";
+use crate::run_folder::{RECORD, REPORT};
 
 /// Arguments of `sci report`.
 #[derive(Debug, clap::Args)]
@@ -54,10 +51,10 @@ impl Args {
     }
 
     fn page_of_one(&self, dir: &Path, record: &Record) -> anyhow::Result<()> {
-        let listed = record.files.iter().any(|name| name == PAGE);
+        let listed = record.files.iter().any(|name| name == REPORT);
         let page = match &self.out {
             Some(page) => page.clone(),
-            None if listed => dir.join(PAGE),
+            None if listed => dir.join(REPORT),
             // A file that the record does not list would be in the way of the next run.
             None => {
                 outln!("the run has no page; to make one, name it with --out FILE.html");

@@ -92,7 +92,11 @@ fn frame(path: &Path, key: &'static str, reading: &Reading) -> Result<Array3<f32
     Ok((frames.sum_axis(Axis(0)) / count).insert_axis(Axis(0)))
 }
 
-fn median(image: &Array2<f32>) -> f32 {
+/// The upper one of two.
+///
+/// # Panics
+/// If there is no pixel.
+pub(crate) fn median(image: &Array2<f32>) -> f32 {
     let mut values: Vec<f32> = image.iter().copied().collect();
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f32::total_cmp).1

@@ -18,7 +18,7 @@ mod banded;
 #[cfg(test)]
 mod camera_tests;
 mod error;
-mod field;
+pub(crate) mod field;
 mod layout;
 mod names;
 mod read;
