@@ -14,8 +14,9 @@ use sci_forward::{MaskError, MaskStack, brightness};
 const RADIUS: usize = 4;
 /// The largest slope of a brightness there, as a share of it.
 const EVEN: f32 = 0.012;
-/// Even pixels that a gain must at least have.
+/// Even pixels that a gain must at least have, and those that are used in all at most, about.
 const LEAST: usize = 40;
+const MOST_PIXELS: usize = 1 << 19;
 /// The weight of gains of 1, as a share of what the pixels say: masks that move by less than their pixels are wide hardly tell a gain from
 /// those before and after.
 const RIDGE: f64 = 3e-3;
@@ -148,8 +149,19 @@ impl Regression {
     fn of(all: &Array3<f32>, measurements: &[Array2<f32>], whole: &[Array2<bool>], gains: &[f64]) -> Option<Self> {
         let mut open = Array2::<f32>::zeros(measurements.first()?.dim());
         all.outer_iter().zip(gains).for_each(|(mask, gain)| open.scaled_add(*gain as f32, &mask));
-        let even = |(y, whole)| even_pixels(all, y, whole, &open);
-        let pixels: Vec<Pixel> = measurements.iter().zip(whole).flat_map(even).collect();
+        let even = |(y, whole)| even_pixels(y, whole, &open);
+        let even: Vec<_> = measurements.iter().zip(whole).map(even).collect();
+        // Every third, fifth and so on where there are more than enough: each takes memory for all frames.
+        let step = even.iter().map(Vec::len).sum::<usize>().div_ceil(MOST_PIXELS).max(1) | 1;
+        let pixel = |y: &Array2<f32>, (at, u): ((usize, usize), f32)| {
+            let root = f64::from(u).sqrt();
+            let light = all.slice(s![.., at.0, at.1]).iter().map(|&c| f64::from(c) * root).collect();
+            Pixel { tile: tile_of(at, y.dim()), light, y: f64::from(y[at]) / root }
+        };
+        let of_one = |(y, even): (&Array2<f32>, Vec<_>)| {
+            even.into_iter().step_by(step).map(|even| pixel(y, even)).collect::<Vec<_>>()
+        };
+        let pixels: Vec<Pixel> = measurements.iter().zip(even).flat_map(of_one).collect();
         (pixels.len() >= LEAST * gains.len()).then_some(Self(pixels))
     }
 
@@ -200,26 +212,23 @@ impl Regression {
     }
 }
 
-/// The pixels of a measurement around which it is even, and `whole`.
-fn even_pixels(all: &Array3<f32>, y: &Array2<f32>, whole: &Array2<bool>, open: &Array2<f32>) -> Vec<Pixel> {
+/// The pixels of a measurement around which it is even, and `whole`, with the brightness there.
+fn even_pixels(y: &Array2<f32>, whole: &Array2<bool>, open: &Array2<f32>) -> Vec<((usize, usize), f32)> {
     let (height, width) = y.dim();
     let brightness = brightness(y.view(), open.view(), RADIUS);
     let middle = brightness.mean().unwrap_or(0.0);
-    let mut pixels = Vec::new();
+    let mut even = Vec::new();
     for i in 2 * RADIUS + 1..height.saturating_sub(2 * RADIUS + 1) {
         for j in 2 * RADIUS + 1..width.saturating_sub(2 * RADIUS + 1) {
             let u = brightness[[i, j]];
             let down = 0.5 * (brightness[[i + 1, j]] - brightness[[i - 1, j]]);
             let right = 0.5 * (brightness[[i, j + 1]] - brightness[[i, j - 1]]);
             if whole[[i, j]] && u > 0.02 * middle && down.hypot(right) < EVEN * u {
-                let root = f64::from(u).sqrt();
-                let light = all.slice(s![.., i, j]).iter().map(|&c| f64::from(c) * root).collect();
-                let tile = tile_of((i, j), (height, width));
-                pixels.push(Pixel { tile, light, y: f64::from(y[[i, j]]) / root });
+                even.push(((i, j), u));
             }
         }
     }
-    pixels
+    even
 }
 
 #[cfg(test)]

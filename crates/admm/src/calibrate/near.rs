@@ -28,8 +28,9 @@ const FAR: f64 = 3.0;
 const BY_ALL: f64 = 0.025;
 /// The least variance of S/S̄ that tells where masks sit: a tenth of that of 32 random masks.
 const UNEVEN: f64 = 3e-3;
-/// Pixels without which nothing is told.
+/// Pixels without which nothing is told, and those that are asked at most, about: large sensors have more than enough, and each takes memory.
 const LEAST: usize = 64;
+const MOST_PIXELS: usize = 1 << 21;
 
 /// One measurement, or one color of it, with the brightness around each pixel, in units of the mean of |y|.
 struct View {
@@ -84,6 +85,7 @@ impl Neighbours {
                 views.push(view);
             }
         }
+        thin_out(&mut views);
         let near = Self { views, each };
         let pixels = near.pixels(masks.sum().view());
         let uneven = pixels.iter().map(|p| (1.0 - p.open).powi(2)).sum::<f64>();
@@ -140,6 +142,17 @@ impl Neighbours {
         let [closed, black] = fitted(&self.pixels(open))?;
         let contrast = (1.0 - closed).min(1.0);
         (contrast > 0.0).then_some(Level { black: black / contrast, contrast, uncertainty: [BY_ALL; 2] })
+    }
+}
+
+/// Leaves every third, fifth and so on of the pixels of each view if there are too many.
+fn thin_out(views: &mut [View]) {
+    let usable = views.iter().map(|view| view.usable.iter().filter(|&&usable| usable).count()).sum::<usize>();
+    let step = usable.div_ceil(MOST_PIXELS).max(1) | 1;
+    for view in views {
+        for (k, usable) in view.usable.iter_mut().filter(|usable| **usable).enumerate() {
+            *usable = k % step == 0;
+        }
     }
 }
 
