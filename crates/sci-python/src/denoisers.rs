@@ -1,7 +1,8 @@
 //! Denoisers: the program's for loops in Python, and any callable of Python for the program's loops.
 
 use std::path::Path;
-use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::ThreadId;
 
 use admm::{BoxError, Call};
 use ndarray::{Array4, ArrayView4, ArrayViewMut4, Axis, Ix4, IxDyn};
@@ -37,7 +38,9 @@ pub(crate) struct Denoiser {
     kind: &'static str,
     color: bool,
     has_sigma: bool,
-    built: Arc<Mutex<Box<dyn Built>>>,
+    built: Mutex<Box<dyn Built>>,
+    /// The thread that has it.
+    holder: Mutex<Option<ThreadId>>,
 }
 
 #[pymethods]
@@ -85,8 +88,8 @@ impl Denoiser {
         let clean = py.detach(|| {
             let mut clean = Array4::zeros(x.dim());
             let call = Call { sigma, iteration, ..Call::default() };
-            let (mut built, mut saving) = (self.lock()?, Saving::default());
-            built.on_frames(&mut saving).denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
+            let (mut held, mut saving) = (self.lock()?, Saving::default());
+            held.built.on_frames(&mut saving).denoise(&call, x.view(), clean.view_mut()).map_err(boxed)?;
             anyhow::Ok(clean)
         });
         let clean = clean.map_err(raised)?.into_shape_with_order(IxDyn(&shape));
@@ -114,7 +117,7 @@ impl Denoiser {
         let built = chosen.part.build(&Site { cfa, adapt: Default::default(), work: &work });
         let built = built.map_err(callers)?;
         let has_sigma = chosen.part.instead_of_sigma().is_none();
-        Ok(Self { kind: chosen.kind, color, has_sigma, built: Arc::new(Mutex::new(built)) })
+        Ok(Self { kind: chosen.kind, color, has_sigma, built: Mutex::new(built), holder: Mutex::new(None) })
     }
 
     fn checked(&self, sigma: Option<f32>) -> PyResult<Option<f32>> {
@@ -132,18 +135,30 @@ impl Denoiser {
         }
     }
 
-    /// One call at a time. A solve has it until its end: a callback that waited for it would wait for ever.
-    fn lock(&self) -> anyhow::Result<MutexGuard<'_, Box<dyn Built>>> {
-        match self.built.try_lock() {
-            Ok(built) => Ok(built),
-            // What a panic left is overwritten by the next call.
-            Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
-            Err(TryLockError::WouldBlock) => {
-                anyhow::bail!(
-                    "this sci.Denoiser is at work in a solve or in another thread; make another one of the same settings"
-                )
-            }
+    /// One call at a time; other threads wait. A callback of the solve that has it would wait for ever.
+    fn lock(&self) -> anyhow::Result<Held<'_>> {
+        let holder = || self.holder.lock().unwrap_or_else(PoisonError::into_inner);
+        if *holder() == Some(std::thread::current().id()) {
+            anyhow::bail!(
+                "this sci.Denoiser is at work in the solve that calls back; make another one for the callback"
+            );
         }
+        // What a panic left is overwritten by the next call.
+        let built = self.built.lock().unwrap_or_else(PoisonError::into_inner);
+        *holder() = Some(std::thread::current().id());
+        Ok(Held { built, holder: &self.holder })
+    }
+}
+
+/// A denoiser that this thread has, until it is dropped.
+struct Held<'d> {
+    built: MutexGuard<'d, Box<dyn Built>>,
+    holder: &'d Mutex<Option<ThreadId>>,
+}
+
+impl Drop for Held<'_> {
+    fn drop(&mut self) {
+        *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 }
 
@@ -189,9 +204,9 @@ impl Plugged {
     ) -> anyhow::Result<T> {
         match self {
             Self::Ours(ours) => {
-                let mut built = ours.get().lock()?;
+                let mut held = ours.get().lock()?;
                 let mut saving = Saving::default();
-                let mut denoiser = built.on_frames(&mut saving);
+                let mut denoiser = held.built.on_frames(&mut saving);
                 solve(denoiser.as_mut())
             }
             Self::Callable(callable) => solve(&mut Callable(callable)),

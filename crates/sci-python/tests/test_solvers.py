@@ -128,6 +128,13 @@ def test_solves_on_several_threads(scene, net):
         np.testing.assert_array_equal(result, expected)
 
 
+def test_a_callback_that_calls_the_denoiser_at_work_fails(scene, net):
+    shown = lambda i, video: net(video, 0.1) is None
+    with pytest.raises(RuntimeError, match="at work"):
+        sci.Gap(net).solve(scene.y[0], scene.masks, [(0.1, 2)], callback=shown)
+    assert net(np.zeros((2, 8, 8), np.float32), 0.1).shape == (2, 8, 8)
+
+
 def test_mistakes_are_value_errors(scene, net):
     tv = sci.Denoiser("tv")
     y, masks = scene.y[0], scene.masks
