@@ -12,6 +12,7 @@ const BUNDLED: &[(&str, &[u8])] = bundled![
     "ffdnet_color",
     "fastdvdnet_gray",
     "fastdvdnet_gray_sci",
+    "fastdvdnet_gray_real_sci",
     "ddnet",
     "fastdvdnet_color",
     "fastdvdnet_color_sci",
