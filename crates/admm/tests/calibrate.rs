@@ -57,11 +57,14 @@ fn a_shift_of_any_sign_is_found_in_every_scene() {
 
 /// The least error of a range may lie at its end because the masks sit beyond.
 #[test]
-fn what_lies_beyond_reach_is_not_called_found() {
-    let shift = [0.0, 1.4];
+fn what_may_lie_beyond_reach_is_said() {
     let near = Calibration { reach: 1.0, ..shifts() };
-    let found = find(&near, measured(&scenes()[0], &MaskMismatch { shift, ..MaskMismatch::default() }));
-    assert!(found.parameters.iter().all(|p| p.value.abs() < 1.0 && p.told_apart == (p.value != 0.0)), "{found:?}");
+    for (right, beyond) in [(0.8, false), (1.0, false), (1.3, true)] {
+        let shift = [0.0, right];
+        let found = find(&near, measured(&scenes()[0], &MaskMismatch { shift, ..MaskMismatch::default() }));
+        let [down, across] = [0, 1].map(|axis| found.parameters[axis].at_end);
+        assert_eq!((down, across), (false, beyond), "{right}: {:?}", found.mismatch);
+    }
 }
 
 #[test]

@@ -81,6 +81,10 @@ fn groups_are_kept_from_call_to_call() {
     // A solve that begins is not one that goes on, nor is one that left a call out, and another size is another video.
     call(4, &noisy);
     assert!(call(6, &other) == anew);
+    // Two calls of an iteration are of two parts.
+    call(20, &noisy);
+    call(20, &noisy);
+    assert!(call(21, &other) == anew);
     call(4, &noisy);
     assert!(call(0, &other) == anew);
     let part = other.slice(ndarray::s![.., .., 4.., ..]).to_owned();

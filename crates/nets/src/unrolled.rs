@@ -298,8 +298,11 @@ impl Recipe {
     }
 }
 
+/// The share of y by which v computed anew with 16-bit numbers may differ.
+const ROUNDED: f32 = 4e-3;
+
 /// The clipped pixels at which the data step from v to x, both `[T, C, H, W]`, left v as it was, since it gave them enough light: those whose light
-/// has not become more, but for rounding. Counted through the rows.
+/// has not become more, but for what 16-bit numbers round. Counted through the rows. Their y1 is taken to be y, as it is after some iterations.
 fn inactive(measurement: &Measurement, v: ArrayView4<'_, f32>, x: ArrayView4<'_, f32>) -> Vec<usize> {
     let Some(level) = measurement.clip() else { return Vec::new() };
     let light = |video: ArrayView4<'_, f32>| {
@@ -312,7 +315,7 @@ fn inactive(measurement: &Measurement, v: ArrayView4<'_, f32>, x: ArrayView4<'_,
     };
     let (before, after) = (light(v), light(x));
     let pixels = before.iter().zip(&after).zip(measurement.y()).enumerate();
-    pixels.filter(|(_, ((v, x), y))| **y >= level && **x - **v <= 1e-3 * **y).map(|(pixel, _)| pixel).collect()
+    pixels.filter(|(_, ((v, x), y))| **y >= level && **x - **v <= ROUNDED * **y).map(|(pixel, _)| pixel).collect()
 }
 
 /// A denoiser that keeps what it is given in these calls (in order). The last of them is not denoised: nothing follows.

@@ -72,6 +72,9 @@ pub struct Parameter {
     pub uncertainty: Option<f64>,
     /// Whether it differs from what was told.
     pub told_apart: bool,
+    /// Whether it may lie further off than was looked.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub at_end: bool,
     /// Values that were tried, and the errors with them.
     pub curve: Vec<(f64, f64)>,
 }
@@ -117,6 +120,7 @@ impl Calibration {
             value: p.value,
             uncertainty: Some(p.uncertainty).filter(|u| u.is_finite()),
             told_apart: p.told_apart,
+            at_end: p.at_end,
             curve: p.curve,
         });
         Self {
@@ -208,7 +212,14 @@ impl Calibration {
                 Some(uncertainty) => format!("{:9.4} ± {uncertainty:.4}", p.value),
                 None => format!("{:9.4}   (not told by the measurements)", p.value),
             };
-            format!("{:<12} {value}{}", p.name, if p.told_apart { "" } else { "   as told" })
+            let remark = match (p.at_end, p.told_apart) {
+                (true, _) => {
+                    "   at the end of what was looked at: it may lie further off; for shifts see --reach of sci calibrate"
+                }
+                (false, true) => "",
+                (false, false) => "   as told",
+            };
+            format!("{:<12} {value}{remark}", p.name)
         };
         let exposure = self.exposure.iter().map(|gains| {
             let gains: Vec<String> = gains.iter().map(|gain| format!("{gain:.2}")).collect();

@@ -183,7 +183,7 @@ impl<'e> Factory<'e> {
     /// The plan, without the stages of a network that is better not to take over from the one that learned.
     fn plan_as_learned(&self) -> Plan {
         let (mut plan, denoisers) = (self.plan.clone(), &self.experiment.denoisers);
-        // TV may go before it, which learns nothing.
+        // The first stages may be TV, which does not learn.
         let mut stages = plan.stages.iter_mut().zip(&self.experiment.stages);
         let learner = stages.find(|(_, own)| denoisers[own.denoiser].part.adapts()).map(|(_, own)| own.denoiser);
         for (stage, own) in stages {

@@ -155,8 +155,8 @@ impl Measurement {
         self.variance.as_ref().map(|variance| variance.view())
     }
 
-    /// The least `diag(H Hᵀ)` of a pixel that tells something of the video: a fiftieth of the mean of those that are open at all. What is
-    /// divided by less is the sensor's noise.
+    /// The least `diag(H Hᵀ)` of a pixel that tells something of the video: a fiftieth of the mean of those that are open at all. Errors
+    /// are compared over that number, so that noise at a pixel of less would outweigh fifty others; of binary masks hardly any pixel is so.
     ///
     /// ```
     /// use ndarray::array;

@@ -56,14 +56,20 @@ fn median(values: impl Iterator<Item = f32>) -> Option<f32> {
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-/// The step of a sensor of whole numbers: the least between values that are not rare; 0 if there is one such value or none.
-fn step(values: &[f32]) -> f32 {
+/// The least distance from `middle`, where it is that of a sensor of whole numbers; else 0. Values that are stuck far off are fewer than those that
+/// noise moves by one step.
+fn step(values: &[f32], middle: f32) -> f32 {
+    let off = || values.iter().map(|y| (y - middle).abs()).filter(|off| *off > 0.0);
+    let least = off().fold(f32::INFINITY, f32::min);
+    if off().filter(|off| *off == least).count() * 100 > 8 * values.len() { least } else { 0.0 }
+}
+
+/// How many different numbers there are.
+fn distinct(values: &[f32]) -> usize {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);
-    let usual: Vec<f32> =
-        sorted.chunk_by(|a, b| a == b).filter(|equal| equal.len() * 50 > values.len()).map(|equal| equal[0]).collect();
-    let least = usual.windows(2).map(|pair| pair[1] - pair[0]).fold(f32::INFINITY, f32::min);
-    if least.is_finite() { least } else { 0.0 }
+    sorted.dedup();
+    sorted.len()
 }
 
 impl Noise {
@@ -122,14 +128,16 @@ impl Noise {
         // A sensor that has no negative numbers shows the upper half of its noise alone; the other half is its lowest number.
         let lowest = dark.iter().copied().fold(f32::INFINITY, f32::min);
         let above: Vec<f32> = dark.iter().map(|y| y - lowest).filter(|y| *y > 0.0).collect();
-        let half = (0.3..=0.6).contains(&(above.len() as f32 / dark.len() as f32));
+        let share = above.len() as f32 / dark.len() as f32;
+        // Two or three numbers are a pedestal between two steps.
+        let half = (0.3..=0.6).contains(&share) && distinct(&above) > 2;
         let black = median(dark.iter().copied())?;
         let off: Vec<f32> = if half { above } else { dark.iter().map(|y| y - black).collect() };
-        let most = FARTHEST * median(off.iter().map(|y| y.abs()))?.max(step(&dark));
+        let most = FARTHEST * median(off.iter().map(|y| y.abs()))?.max(step(&dark, black));
         let near: Vec<f64> = off.iter().filter(|y| y.abs() <= most).map(|&y| f64::from(y)).collect();
         let mean = if half { 0.0 } else { near.iter().sum::<f64>() / near.len() as f64 };
         let squares = near.iter().map(|y| (y - mean).powi(2)).sum::<f64>();
-        // The other half is as large.
+        // The lower half, which the sensor shows as its lowest number, is off as far.
         let variance = if half { 2.0 * squares / dark.len() as f64 } else { squares / near.len() as f64 };
         Some(Self { photons: None, sigma: variance.sqrt() })
     }
@@ -239,12 +247,17 @@ mod tests {
     #[test]
     fn noise_is_found_at_closed_pixels_of_whole_numbers() {
         let open = Array2::from_shape_fn((64, 64), |(i, j)| if (i * 7 + j) % 11 == 0 { 0.0 } else { 4.0f32 });
-        for (pedestal, sigma) in [(0.0, 2.5), (0.0, 10.0), (20.0, 0.5), (20.0, 0.7), (20.0, 3.0), (0.0, 0.0)] {
+        for (pedestal, sigma) in
+            [(0.0, 2.5), (0.0, 10.0), (20.0, 0.5), (20.0, 0.7), (20.0, 3.0), (0.0, 0.0), (20.5, 0.2)]
+        {
             let noise = Noise::new(None, sigma).unwrap();
             let mut y = noise.apply((&open * 30.0 + pedestal).view(), 3).mapv(|y| y.round().max(0.0));
-            y[[0, 0]] = 200.0; // hot
+            // Hot ones, one in 22 of those that are closed.
+            y.iter_mut().zip(&open).filter(|(_, open)| **open == 0.0).step_by(22).for_each(|(y, _)| *y = 255.0);
             let found = Noise::of_closed_pixels(y.insert_axis(ndarray::Axis(0)).view(), open.view()).unwrap();
-            let (found, expected) = (found.variance(0.0).sqrt(), sigma as f32);
+            // Rounding is noise too: between two steps it is half of one.
+            let expected = if pedestal == 20.5 { 0.5 } else { sigma as f32 };
+            let found = found.variance(0.0).sqrt();
             assert!((found - expected).abs() <= 0.15 * expected + 0.05, "{pedestal}, {sigma}: {found}");
         }
     }

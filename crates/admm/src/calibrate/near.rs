@@ -150,9 +150,9 @@ fn thin_out(views: &mut [View]) {
     let usable = views.iter().map(|view| view.usable.iter().filter(|&&usable| usable).count()).sum::<usize>();
     let step = usable.div_ceil(MOST_PIXELS).max(1) | 1;
     for view in views {
-        for (k, usable) in view.usable.iter_mut().filter(|usable| **usable).enumerate() {
-            *usable = k % step == 0;
-        }
+        // Another place in each row, so that nothing that repeats is always left out.
+        let usable = view.usable.indexed_iter_mut().filter(|(_, usable)| **usable);
+        usable.enumerate().for_each(|(k, ((row, _), usable))| *usable = (k + row).is_multiple_of(step));
     }
 }
 

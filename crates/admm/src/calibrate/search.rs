@@ -79,6 +79,8 @@ pub(super) struct Search<'s> {
     curves: Vec<Vec<(f64, f64)>>,
     /// One standard deviation of each axis, and whether its value differs from what was told.
     found: Vec<(f64, bool)>,
+    /// Whether the least error lies beyond its range.
+    beyond: Vec<bool>,
 }
 
 impl<'s> Search<'s> {
@@ -91,6 +93,7 @@ impl<'s> Search<'s> {
             reach: settings.reach,
             curves: vec![Vec::new(); axes.len()],
             found: vec![(f64::INFINITY, false); axes.len()],
+            beyond: vec![false; axes.len()],
             axes,
             told,
             by: By::HeldOut,
@@ -147,6 +150,7 @@ impl<'s> Search<'s> {
         }
         for &axis in &axes {
             self.found[axis].0 = self.uncertainty(axis)?;
+            self.beyond[axis] = self.falls_beyond(axis)?;
         }
         self.leave_as_told(&axes)
     }
@@ -235,12 +239,8 @@ impl<'s> Search<'s> {
 
     /// Each group of pixels has a parabola of its own; the spread of their minima, by the root of their number.
     fn uncertainty(&mut self, axis: usize) -> Result<f64, CalibrateError> {
-        let Axis { get, step, range: (least, most), .. } = self.axes[axis];
+        let Axis { get, step, .. } = self.axes[axis];
         let (at, middle) = (get(&self.best), self.best_errors);
-        // The least error of a range that lies at its end may lie anywhere beyond.
-        if (at <= least || at >= most) && at != get(&self.told) && self.falls_beyond(axis)? {
-            return Ok(f64::INFINITY);
-        }
         let (below, above) = (self.errors(&self.with(axis, at - step))?, self.errors(&self.with(axis, at + step))?);
         let curvature = |g: usize| below.0[g] - 2.0 * middle.0[g] + above.0[g];
         let total: f64 = (0..GROUPS).map(curvature).sum();
@@ -254,10 +254,13 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
-    /// Whether the error would go on falling beyond the end of the range at which the best value is, as far as a parabola tells.
+    /// Whether the best value is at an end of its range and the error would go on falling beyond, as far as a parabola tells.
     fn falls_beyond(&mut self, axis: usize) -> Result<bool, CalibrateError> {
-        let Axis { get, step, range: (_, most), .. } = self.axes[axis];
+        let Axis { get, step, range: (least, most), .. } = self.axes[axis];
         let (at, short) = (get(&self.best), 0.2 * step);
+        if least < at && at < most || at == get(&self.told) {
+            return Ok(false);
+        }
         let inward = if at >= most { -short } else { short };
         let [near, far] = [1.0, 2.0].map(|steps| at + steps * inward);
         let points = [
@@ -341,10 +344,11 @@ impl<'s> Search<'s> {
 
     fn parameters(&mut self) -> Vec<Parameter> {
         let curves = std::mem::take(&mut self.curves);
-        let all = self.axes.iter().zip(&self.found).zip(curves);
-        all.map(|((axis, &(uncertainty, told_apart)), mut curve)| {
+        let all = self.axes.iter().zip(&self.found).zip(&self.beyond).zip(curves);
+        all.map(|(((axis, &(uncertainty, told_apart)), &beyond), mut curve)| {
             curve.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Parameter { name: axis.name, value: (axis.get)(&self.best), uncertainty, told_apart, curve }
+            let at_end = beyond && told_apart;
+            Parameter { name: axis.name, value: (axis.get)(&self.best), uncertainty, told_apart, at_end, curve }
         })
         .collect()
     }

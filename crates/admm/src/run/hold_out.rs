@@ -17,7 +17,9 @@ use sci_forward::Measurement;
 /// E(x) = mean over held-out pixels of r²/g  +  mean over the others of r²/(g T)
 /// ```
 ///
-/// Pixels that masks leave nearly closed ([`Measurement::least_telling`]) are not asked. At a pixel held out, r is a sum of T errors that no data step has touched, with variance g · MSE when they are
+/// Pixels that masks leave nearly closed ([`Measurement::least_telling`]) are not asked.
+///
+/// At a pixel held out, r is a sum of T errors that no data step has touched, with variance g · MSE when they are
 /// independent. At the others it is the part of the error in the range of `Hᵀ`, 1/T of the dimensions, which a jump of σ
 /// makes large where the pixels held out see nothing.
 ///

@@ -95,8 +95,7 @@ impl<P: Prior> Gap<P> {
         };
         if let Some(y1) = self.y1.as_mut().filter(|_| steep && self.restarts) {
             y1.assign(&measurement.y());
-            let precision = self.known.precision(measurement, v.sensor.view());
-            let step = DataStep { precision, ..DataStep::default() };
+            let step = DataStep { precision: self.known.precision, ..DataStep::default() };
             step.apply(measurement, v.sensor.view(), self.x.view_mut());
         }
     }

@@ -15,6 +15,8 @@ use sci_forward::Measurement;
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Known {
     error: f64,
+    /// Of the last iterate.
+    pub(super) precision: f32,
 }
 
 /// The least mean square error that a video is taken to have, 52 dB.
@@ -31,6 +33,7 @@ impl Known {
         let open: f64 = measurement.operator().gram().iter().map(|&gram| f64::from(gram)).sum();
         let error = progress(measurement, v, v).residual / open.max(f64::MIN_POSITIVE);
         self.error = error.max(FALL * self.error).max(LEAST_ERROR);
-        (1.0 / self.error) as f32
+        self.precision = (1.0 / self.error) as f32;
+        self.precision
     }
 }

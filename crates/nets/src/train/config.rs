@@ -478,7 +478,9 @@ impl TrainConfig {
         check((0.0..=0.5).contains(holes), "camera.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(saturated), "camera.saturated", saturated, "0 to 1")?;
         check((0.0..=1.0).contains(mask_errors), "camera.mask_errors", mask_errors, "0 to 1")?;
-        check((0.0..=0.5).contains(mask_grain), "camera.mask_grain", mask_grain, "0 to 0.5")?;
+        let moves = *mask_grain == 0.0 || masks.contains(&MaskKind::Shifting);
+        let legal = "0 to 0.5; 0 without \"shifting\" in camera.masks";
+        check(moves && (0.0..=0.5).contains(mask_grain), "camera.mask_grain", mask_grain, legal)?;
         check((0.0..=1.0).contains(noisy), "camera.noisy", noisy, "0 to 1")
     }
 

@@ -148,6 +148,7 @@ fn scene_of(record: &Record) -> anyhow::Result<Scene> {
     let files = [
         ("data.path", &data["path"]),
         ("data.mask", &data["mask"]),
+        ("data.mask.path", &data["mask"]["path"]),
         ("data.calibration", &data["calibration"]),
         ("data.sensor.dark", &data["sensor"]["dark"]),
         ("data.sensor.white", &data["sensor"]["white"]),

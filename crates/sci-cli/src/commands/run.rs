@@ -230,24 +230,26 @@ fn solve(
     studio.in_step(&before, |show| solving::solve_all(experiment, scene, own, factory, folder, show))
 }
 
-/// Of all files that it reads: masks, weights, a calibration, dark and white frames; of the data where it was read as a whole.
-fn checksum_of_files(experiment: &Experiment, subject: &Subject) -> anyhow::Result<u32> {
-    let mut sum = crc32fast::Hasher::new();
+/// Of each file that it reads, by its key: masks, weights, a calibration, dark and white frames; of the data where it was read as a whole.
+fn checksums_of_files(experiment: &Experiment, subject: &Subject) -> anyhow::Result<serde_json::Value> {
     let cut = matches!(subject, Subject::Cut(_));
+    let mut sums = std::collections::BTreeMap::<&str, crc32fast::Hasher>::new();
     for (key, path) in experiment.inputs().into_iter().filter(|(key, _)| !(cut && *key == "data.path")) {
-        add_files(path, &mut sum).with_context(|| format!("{key}: {}", path.display()))?;
+        add_files(path, sums.entry(key).or_default()).with_context(|| format!("{key}: {}", path.display()))?;
     }
-    Ok(sum.finalize())
+    let sums = sums.into_iter().map(|(key, sum)| (key.to_owned(), format!("{:08x}", sum.finalize()).into()));
+    Ok(serde_json::Value::Object(sums.collect()))
 }
 
-/// Adds the bytes of a file, or of all files of a folder.
+/// Adds the bytes of a file, or of the arrays of a folder.
 fn add_files(path: &Path, sum: &mut crc32fast::Hasher) -> std::io::Result<()> {
     if path.is_dir() {
         let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
         files.sort();
-        return files.iter().filter(|file| file.is_file()).try_for_each(|file| add_files(file, sum));
+        let arrays = files.iter().filter(|file| file.extension().is_some_and(|e| e == "npy"));
+        return arrays.into_iter().try_for_each(|file| add_files(file, sum));
     }
-    // What is no file cannot be read twice.
+    // A pipe cannot be read twice.
     if !path.is_file() {
         return Ok(());
     }
@@ -270,7 +272,7 @@ fn identity(experiment: &Experiment, subject: &Subject, chosen: &[usize]) -> any
         "measurements": chosen,
         "checksums": {
             "data": format!("{:08x}", subject.checksum(chosen)?),
-            "files": format!("{:08x}", checksum_of_files(experiment, subject)?),
+            "files": checksums_of_files(experiment, subject)?,
         },
         "config": experiment.to_json(),
     }))

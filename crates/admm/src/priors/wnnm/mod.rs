@@ -116,6 +116,8 @@ struct Matched {
     iteration: usize,
     /// The iteration of the last call that used them.
     last: usize,
+    /// Whether that iteration had one call alone, of the whole video then.
+    alone: bool,
 }
 
 impl std::fmt::Debug for Matched {
@@ -135,14 +137,15 @@ impl Wnnm {
         // A video goes on with the next iteration; another run, or another part of the video, does not.
         let goes_on = |matched: &&mut Matched| {
             let recent = call.iteration < matched.iteration.saturating_add(self.params.match_every);
-            recent && call.iteration == matched.last + 1 && matched.groups.grid == grid
+            recent && call.iteration == matched.last + 1 && matched.alone && matched.groups.grid == grid
         };
         if let Some(matched) = self.matched.as_mut().filter(goes_on) {
             matched.last = call.iteration;
             return Arc::clone(&matched.groups);
         }
         let (groups, iteration) = (Arc::new(Groups::new(grid, self.params, noisy)), call.iteration);
-        self.matched = Some(Matched { groups: Arc::clone(&groups), iteration, last: iteration });
+        let alone = self.matched.as_ref().is_none_or(|matched| matched.last != iteration);
+        self.matched = Some(Matched { groups: Arc::clone(&groups), iteration, last: iteration, alone });
         groups
     }
 }

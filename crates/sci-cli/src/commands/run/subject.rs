@@ -47,7 +47,7 @@ impl Subject {
         let (shape, footprint) = (scene.operator.shape(), experiment.footprint(scene.cfa.is_some()));
         if let Some(memory) = experiment.memory.filter(|&memory| footprint.bytes(shape) > memory) {
             let why = experiment.needs_whole().map_or_else(
-                || "this file cannot be read in bands; .npz, .npy, .h5 and .mat of version 7.3 can".to_owned(),
+                || "this cannot be read in bands; .npz, .npy, .h5 and .mat of version 7.3 can, but not masks in .mat with data in another or the reverse".to_owned(),
                 |(key, why)| format!("`{key}` does not go with bands: {why}"),
             );
             let (memory, needed) = (megabytes(memory), megabytes(footprint.bytes(shape)));
