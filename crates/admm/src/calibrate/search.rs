@@ -280,6 +280,8 @@ impl<'s> Search<'s> {
         let like = |level: &Level| (level.contrast - 1.0).abs() <= LIKE;
         let sure = |level: &Level| level.uncertainty.iter().all(|uncertainty| *uncertainty <= SURE);
         let closed = near.level(open.view()).filter(|level| sure(level) && like(level));
+        // What all pixels tell is biased where a scene has fine texture: it has to be worth more.
+        let margin = if closed.is_some() { 1.0 } else { 1.0 + WORTH };
         let Some(level) = closed.or_else(|| near.level_by_all(open.view())) else { return Ok(()) };
         for &axis in &axes {
             let Axis { name, .. } = self.axes[axis];
@@ -292,7 +294,9 @@ impl<'s> Search<'s> {
                 self.best = self.with(axis, value);
             }
         }
-        if self.best != point && self.judge.held_out(&self.best)?.total() > self.judge.held_out(&point)?.total() {
+        if self.best != point
+            && margin * self.judge.held_out(&self.best)?.total() > self.judge.held_out(&point)?.total()
+        {
             self.best = point;
             axes.iter().for_each(|&axis| self.found[axis].1 = false);
         }
