@@ -62,7 +62,7 @@ pub struct Record {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<crate::calibration::Calibration>,
     /// Of the measurements, and of the files that it read: another run with these has other results. Null in records of before.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "serde_json::Value::is_null")]
     pub checksums: serde_json::Value,
     /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
     /// what it `extends` and the `--set`s.

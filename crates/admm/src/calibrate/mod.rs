@@ -116,7 +116,7 @@ pub struct Parameter {
     pub uncertainty: f64,
     /// Whether the value differs from what was told by more than the data leave open; else it is what was told.
     pub told_apart: bool,
-    /// Whether it is an end of the range that was looked at, and the error would go on falling beyond: masks may sit further off.
+    /// Whether it is an end of the range that was looked at: masks may sit further off.
     pub at_end: bool,
     /// Values that were tried, and the errors with them, in the order of values.
     pub curve: Vec<(f64, f64)>,

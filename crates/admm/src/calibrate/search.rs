@@ -79,8 +79,6 @@ pub(super) struct Search<'s> {
     curves: Vec<Vec<(f64, f64)>>,
     /// One standard deviation of each axis, and whether its value differs from what was told.
     found: Vec<(f64, bool)>,
-    /// Whether the least error lies beyond its range.
-    beyond: Vec<bool>,
 }
 
 impl<'s> Search<'s> {
@@ -93,7 +91,6 @@ impl<'s> Search<'s> {
             reach: settings.reach,
             curves: vec![Vec::new(); axes.len()],
             found: vec![(f64::INFINITY, false); axes.len()],
-            beyond: vec![false; axes.len()],
             axes,
             told,
             by: By::HeldOut,
@@ -150,7 +147,6 @@ impl<'s> Search<'s> {
         }
         for &axis in &axes {
             self.found[axis].0 = self.uncertainty(axis)?;
-            self.beyond[axis] = self.falls_beyond(axis)?;
         }
         self.leave_as_told(&axes)
     }
@@ -254,21 +250,11 @@ impl<'s> Search<'s> {
         Ok(step * (GROUPS as f64 * variance).sqrt() / total)
     }
 
-    /// Whether the best value is at an end of its range and the error would go on falling beyond, as far as a parabola tells.
-    fn falls_beyond(&mut self, axis: usize) -> Result<bool, CalibrateError> {
-        let Axis { get, step, range: (least, most), .. } = self.axes[axis];
-        let (at, short) = (get(&self.best), 0.2 * step);
-        if least < at && at < most || at == get(&self.told) {
-            return Ok(false);
-        }
-        let inward = if at >= most { -short } else { short };
-        let [near, far] = [1.0, 2.0].map(|steps| at + steps * inward);
-        let points = [
-            (at, self.best_errors.total()),
-            (near, self.errors(&self.with(axis, near))?.total()),
-            (far, self.errors(&self.with(axis, far))?.total()),
-        ];
-        Ok(vertex(points).is_none_or(|lowest| (lowest - at) * inward < -0.5 * short * short))
+    /// Whether the best value is at an end of its range: the least error of all may lie beyond.
+    fn is_at_end(&self, axis: usize) -> bool {
+        let Axis { get, slight, range: (least, most), .. } = self.axes[axis];
+        let at = get(&self.best);
+        at <= least + 2.0 * slight || at >= most - 2.0 * slight
     }
 
     /// Black level and contrast as nearly closed pixels tell them, or, where these are too few, all. A scene may imitate some of either: held-out pixels
@@ -348,10 +334,10 @@ impl<'s> Search<'s> {
 
     fn parameters(&mut self) -> Vec<Parameter> {
         let curves = std::mem::take(&mut self.curves);
-        let all = self.axes.iter().zip(&self.found).zip(&self.beyond).zip(curves);
-        all.map(|(((axis, &(uncertainty, told_apart)), &beyond), mut curve)| {
+        let all = self.axes.iter().zip(&self.found).zip(curves).enumerate();
+        all.map(|(index, ((axis, &(uncertainty, told_apart)), mut curve))| {
             curve.sort_by(|a, b| a.0.total_cmp(&b.0));
-            let at_end = beyond && told_apart;
+            let at_end = told_apart && self.is_at_end(index);
             Parameter { name: axis.name, value: (axis.get)(&self.best), uncertainty, told_apart, at_end, curve }
         })
         .collect()
