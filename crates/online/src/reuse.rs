@@ -88,10 +88,7 @@ pub fn continuation(previous: ArrayView3<'_, f32>, measurement: &Measurement) ->
 
 /// `‖y − H x‖ / ‖y‖` over the open pixels.
 fn relative_residual(measurement: &Measurement, hx: &Array2<f32>) -> f64 {
-    let mut y = measurement.y().to_owned();
-    if let (Some(y), Some(hx)) = (y.as_slice_mut(), hx.as_slice()) {
-        measurement.one_sided(y, hx);
-    }
+    let y = measurement.y_against(hx.view());
     let open = Zip::from(hx).and(&y).and(measurement.operator().gram());
     let squares = open.fold(0.0, |sum, &hx, &y, &gram| if gram > 0.0 { sum + f64::from(hx - y).powi(2) } else { sum });
     squares.sqrt() / measurement.scale()

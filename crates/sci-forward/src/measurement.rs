@@ -150,6 +150,16 @@ impl Measurement {
         }
     }
 
+    /// y `[H, W]` as `H x` is to be compared with it: [one-sided](Self::one_sided) where it is clipped.
+    ///
+    /// # Panics
+    /// If the sizes differ.
+    pub fn y_against(&self, hx: ArrayView2<'_, f32>) -> Array2<f32> {
+        let mut y = self.y.clone();
+        Zip::from(&mut y).and(hx).for_each(|y, hx| self.one_sided(std::slice::from_mut(y), std::slice::from_ref(hx)));
+        y
+    }
+
     /// The variance of the noise of each pixel `[H, W]`, where noise is known of.
     pub fn variance(&self) -> Option<ArrayView2<'_, f32>> {
         self.variance.as_ref().map(|variance| variance.view())

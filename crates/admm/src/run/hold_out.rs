@@ -198,10 +198,7 @@ impl HeldOut {
     /// E of an iterate: rows in parallel, their sums in order.
     fn error(&self, x: ArrayView3<'_, f32>) -> f64 {
         let hx = self.full.operator().forward(x);
-        let mut y = self.full.y().to_owned();
-        if let (Some(y), Some(hx)) = (y.as_slice_mut(), hx.as_slice()) {
-            self.full.one_sided(y, hx);
-        }
+        let y = self.full.y_against(hx.view());
         let of_row = |row: usize| {
             let (y, hx, weight) = (y.row(row), hx.row(row), self.weight.row(row));
             let square = |y: f32, hx: f32| f64::from(y - hx).powi(2);

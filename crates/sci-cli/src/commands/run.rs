@@ -5,10 +5,10 @@ mod finishing;
 mod solving;
 mod subject;
 
-use std::fs::{self, File};
-use std::io::{BufRead, BufReader};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use std::{fs, io};
 
 use anyhow::Context;
 use ndarray::Axis;
@@ -24,7 +24,7 @@ use crate::factory::Factory;
 use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
 use crate::record::host;
-use crate::run_folder::{self, About, Finished, Layout, RunFolder, RunPlan, Wish, refuse_inputs};
+use crate::run_folder::{self, About, Finished, Layout, RunFolder, RunPlan, Wish, checksum, refuse_inputs};
 use crate::shard::{Shard, ranges};
 use crate::simulate::simulate;
 use crate::solve;
@@ -233,36 +233,27 @@ fn solve(
 /// Of each file that it reads, by its key: masks, weights, a calibration, dark and white frames; of the data where it was read as a whole.
 fn checksums_of_files(experiment: &Experiment, subject: &Subject) -> anyhow::Result<serde_json::Value> {
     let cut = matches!(subject, Subject::Cut(_));
-    let mut sums = std::collections::BTreeMap::<&str, crc32fast::Hasher>::new();
+    let mut sums = BTreeMap::<&str, crc32fast::Hasher>::new();
     for (key, path) in experiment.inputs().into_iter().filter(|(key, _)| !(cut && *key == "data.path")) {
-        add_files(path, sums.entry(key).or_default()).with_context(|| format!("{key}: {}", path.display()))?;
+        let sum = sums.entry(key).or_default();
+        let files =
+            files_of(path).and_then(|files| files.iter().map(|file| checksum(file)).collect::<io::Result<Vec<_>>>());
+        let files = files.with_context(|| format!("{key}: {}", path.display()))?;
+        files.iter().for_each(|of_file| sum.update(&of_file.to_le_bytes()));
     }
     let sums = sums.into_iter().map(|(key, sum)| (key.to_owned(), format!("{:08x}", sum.finalize()).into()));
     Ok(serde_json::Value::Object(sums.collect()))
 }
 
-/// Adds the bytes of a file, or of the arrays of a folder.
-fn add_files(path: &Path, sum: &mut crc32fast::Hasher) -> std::io::Result<()> {
-    if path.is_dir() {
-        let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
-        files.sort();
-        let arrays = files.iter().filter(|file| file.extension().is_some_and(|e| e == "npy"));
-        return arrays.into_iter().try_for_each(|file| add_files(file, sum));
+/// The file itself, or the arrays of a folder; nothing of a pipe, which cannot be read twice.
+fn files_of(path: &Path) -> io::Result<Vec<PathBuf>> {
+    if !path.is_dir() {
+        return Ok(Some(path.to_owned()).filter(|path| path.is_file()).into_iter().collect());
     }
-    // A pipe cannot be read twice.
-    if !path.is_file() {
-        return Ok(());
-    }
-    let mut file = BufReader::with_capacity(1 << 20, File::open(path)?);
-    loop {
-        let bytes = file.fill_buf()?;
-        if bytes.is_empty() {
-            return Ok(());
-        }
-        sum.update(bytes);
-        let count = bytes.len();
-        file.consume(count);
-    }
+    let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
+    files.retain(|file| file.is_file() && file.extension().is_some_and(|e| e == "npy"));
+    files.sort();
+    Ok(files)
 }
 
 /// Everything that the bits of a run depend on, but for the kernel.

@@ -30,7 +30,7 @@ use serde_json::Value;
 pub use destination::refuse_inputs;
 pub use layout::{Layout, PREVIEW, REPORT, frame_name};
 pub use shards::{About, Command, Joined, Missing, Shards};
-pub use store::{Finished, read_video};
+pub use store::{Finished, checksum, read_video};
 
 use crate::io::output::{WriteError, write_atomically};
 use crate::record::{Record, Stop};

@@ -245,7 +245,11 @@ fn write_array<D: Dimension>(path: &Path, array: &ArrayBase<impl Data<Elem = f32
     Ok(sink.sum.finalize())
 }
 
-fn checksum(path: &Path) -> io::Result<u32> {
+/// Of the bytes of a file.
+///
+/// # Errors
+/// The file system's.
+pub fn checksum(path: &Path) -> io::Result<u32> {
     let mut sink = Sum { inner: io::sink(), sum: crc32fast::Hasher::new() };
     io::copy(&mut io::BufReader::with_capacity(1 << 20, File::open(path)?), &mut sink)?;
     Ok(sink.sum.finalize())
