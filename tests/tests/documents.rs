@@ -19,7 +19,8 @@ use sci_cli::table::Source;
 /// What takes minutes, or needs what a test may not have: such lines are parsed, and their experiments checked.
 const ONLY_CHECKED: [&str; 4] = ["sci train", "/adaptive", "clip.mp4", "sci run gray/refined"];
 /// What the documents call beside `sci`.
-const OTHERS: [&str; 7] = ["cargo ", "rustup ", "CC_", "pip install ", "pytest ", "sbatch ", "parallel "];
+const OTHERS: [&str; 8] =
+    ["cargo ", "rustup ", "CC_", "pip install ", "pytest ", "python -m sci.gpu.train ", "sbatch ", "parallel "];
 
 fn documents() -> Vec<PathBuf> {
     let root = workspace();
