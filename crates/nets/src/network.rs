@@ -86,6 +86,10 @@ pub trait Layers: Send + Sync {
                 vars.extend(conv.make_trainable(which)?);
             }
         }
+        if vars.is_empty() {
+            let (value, legal) = (format!("{which:?}"), "those that this network has: it has no batch norm".to_owned());
+            return Err(Error::Setting { key: "parameters", value, legal });
+        }
         Ok(vars)
     }
 

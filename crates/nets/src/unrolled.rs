@@ -7,8 +7,8 @@
 use crate::kernels::with_numbers;
 use crate::{Error, Network, Result};
 use admm::{
-    BoxError, Call, Demosaicked, Denoiser, Dimmed, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start, Tv,
-    flipped_axes, run,
+    BoxError, Call, Demosaicked, Denoiser, Dimmed, Flips, Gap, Plan, Prior, SolveError, Solver, Stage, Start,
+    StopReason, Tv, flipped_axes, run,
 };
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
@@ -135,15 +135,28 @@ impl Gradients {
 pub type LossOfResult<'l> = dyn Fn(ArrayView4<'_, f32>) -> Result<(f32, Array4<f32>), BoxError> + 'l;
 
 impl Recipe {
-    /// The result `[T, C, H, W]` of all calls.
+    /// The result `[T, C, H, W]` of all calls; where they diverge, what they came from.
     ///
     /// # Errors
     /// That of the denoiser; [`Error::Data`] when it cannot be solved.
     pub fn solve(&self, measurement: &Measurement, denoiser: &mut dyn Denoiser) -> Result<Array4<f32>> {
-        self.solve_calls(measurement, self.turning(denoiser), self.sigmas.len())
+        Ok(self.solve_calls(measurement, self.turning(denoiser), self.sigmas.len())?.0)
     }
 
-    /// What the denoiser is given in these calls (in order, counted from 0).
+    /// The same; nothing where they diverge.
+    ///
+    /// # Errors
+    /// As [`Recipe::solve`].
+    pub fn solve_to_the_end(
+        &self,
+        measurement: &Measurement,
+        denoiser: &mut dyn Denoiser,
+    ) -> Result<Option<Array4<f32>>> {
+        let (result, stop) = self.solve_calls(measurement, self.turning(denoiser), self.sigmas.len())?;
+        Ok((stop != StopReason::Diverged).then_some(result))
+    }
+
+    /// What the denoiser is given in these calls (in order, counted from 0); in fewer where they diverge.
     ///
     /// # Errors
     /// As [`Recipe::solve`].
@@ -169,7 +182,7 @@ impl Recipe {
         measurement: &Measurement,
         denoiser: Box<dyn Denoiser + '_>,
         count: usize,
-    ) -> Result<Array4<f32>> {
+    ) -> Result<(Array4<f32>, StopReason)> {
         let stages: Vec<Stage> =
             self.sigmas[..count].iter().map(|&s| Stage { sigma: Some(s), iterations: 1 }).collect();
         let cfa = measurement.cfa();
@@ -188,16 +201,17 @@ impl Recipe {
             if self.accelerate { Box::new(Gap::accelerated(prior)) } else { Box::new(Gap::plain(prior)) };
         let outcome = run(&mut *solver, measurement, start, &Plan::new(stages), &mut ()).map_err(typed)?;
         // The start, to which a divergence goes back, has no RGB video.
-        match (outcome.estimate.rgb, cfa) {
-            (Some(rgb), _) => Ok(rgb),
-            (None, None) => Ok(outcome.estimate.sensor.insert_axis(Axis(1))),
+        let result = match (outcome.estimate.rgb, cfa) {
+            (Some(rgb), _) => rgb,
+            (None, None) => outcome.estimate.sensor.insert_axis(Axis(1)),
             (None, Some(cfa)) => {
                 let (frames, height, width) = outcome.estimate.sensor.dim();
                 let mut rgb = Array4::zeros((frames, 3, height, width));
                 Menon.demosaic(cfa, outcome.estimate.sensor.view(), rgb.view_mut()).map_err(unusable)?;
-                Ok(rgb)
+                rgb
             }
-        }
+        };
+        Ok((result, outcome.stop))
     }
 
     /// The weighted mean loss of the results of consecutive calls, each of half the weight of the one after it, as the last is what a

@@ -395,6 +395,9 @@ fn a_damaged_checkpoint_is_refused_and_the_one_before_it_used() {
         let refused = resumed.refused.unwrap().to_string();
         assert!(refused.contains("run.safetensors") && refused.contains("not a whole checkpoint"), "{refused}");
     }
+    // The damaged one is gone, so that the next does not take the place of the good one.
+    assert!(!path.exists());
+    std::fs::write(&path, &whole[..9]).unwrap();
     std::fs::remove_file(folder.path().join("run.previous.safetensors")).unwrap();
     let mut third = trainer(&config);
     assert!(matches!(third.resume(&path), Err(Error::Format { .. })));
@@ -591,4 +594,30 @@ fn learning_rates_rise_and_fall() {
     let rates: Vec<f64> = (0..11).map(|s| config.learning_rate(s)).collect();
     assert_eq!((rates[0], rates[1], rates[2]), (1e-3, 2e-3, 2e-3));
     assert!(rates[2..].windows(2).all(|w| w[1] < w[0]) && rates[10] < 1e-9);
+}
+
+/// An expert that no lesson of a run reaches has no means, is not idle, and stays what it was.
+#[test]
+fn experts_that_are_never_asked_are_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let experts = nets::Experts::new(&[40, 20]).unwrap();
+    let network = NetworkConfig::Shiftnet { channels: 1, widths: [16, 16, 16], blocks: [1, 1, 1], window: 1, experts };
+    let mut config = on_iterates(config(network, 1, 8));
+    config.iterates = Some(IteratesConfig { sigmas: vec![50.0, 30.0], unrolled: true, ..config.iterates.unwrap() });
+    config.training.revive = 2;
+    let mut first = trainer(&config);
+    let never_asked = |trainer: &Trainer| {
+        let weights = trainer.weights().unwrap().into_iter().filter(|(name, _)| name.starts_with("below20."));
+        weights.map(|(name, t)| (name, t.flatten_all().unwrap().to_vec1::<f32>().unwrap())).collect::<Vec<_>>()
+    };
+    let before = never_asked(&first);
+    run(&mut first, 4);
+    assert!(!before.is_empty() && never_asked(&first) == before);
+    first.save(&path).unwrap();
+    let mut second = trainer(&config);
+    second.resume(&path).unwrap();
+    run(&mut first, 2);
+    run(&mut second, 2);
+    assert_eq!(bits(&first), bits(&second));
 }

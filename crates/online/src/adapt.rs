@@ -85,6 +85,8 @@ impl<N: Network + Denoiser> AdaptiveDenoiser<N> {
     /// [`Error::Setting`].
     pub fn new(mut net: N, config: AdaptConfig) -> Result<Self> {
         config.validate()?;
+        // That there is something to learn is to be known before a solve.
+        net.boxed().make_some_trainable(config.parameters)?;
         net.set_precision(config.precision);
         let pretrained = net.state();
         Ok(Self {

@@ -2,7 +2,7 @@
 
 use crate::reuse::continuation;
 use crate::{AdaptiveDenoiser, Error, Relation, Result, Reuse, Similarity, Update};
-use admm::{Denoiser, Outcome, Plan, SolveError, Start};
+use admm::{Denoiser, Outcome, Plan, SolveError, Start, StopReason};
 use ndarray::{Array3, ArrayView3};
 use nets::Network;
 use sci_forward::Measurement;
@@ -83,6 +83,8 @@ pub struct Sequence {
     config: SequenceConfig,
     previous: Option<Array3<f32>>,
     index: usize,
+    /// Whether what was learned and found before is of no use.
+    forgotten: bool,
 }
 
 impl Sequence {
@@ -100,7 +102,7 @@ impl Sequence {
             let (key, value) = ("unchanged, warm, cut", format!("{unchanged}, {warm}, {cut}"));
             return Err(Error::Setting { key, value, legal: "0 ≤ unchanged ≤ warm, and cut at least 0" });
         }
-        Ok(Self { config, previous: None, index: 0 })
+        Ok(Self { config, previous: None, index: 0, forgotten: false })
     }
 
     /// What is to be done with the next measurement; [`Task::prepare`] readies each denoiser for it.
@@ -114,7 +116,7 @@ impl Sequence {
         let relation = known.as_ref().map(|(_, relation)| *relation);
         let cut = relation.is_some_and(|relation| relation.of_scene() > similarity.cut);
         let within = |limit: f64| !cut && relation.is_some_and(|relation| relation.of_start() <= limit);
-        let fresh = cut || self.config.reuse == Reuse::Reset;
+        let fresh = cut || self.config.reuse == Reuse::Reset || std::mem::take(&mut self.forgotten);
         let effort = if within(similarity.unchanged) { self.config.effort } else { 1.0 };
         let warm = known.filter(|_| within(similarity.warm)).map(|(video, _)| video);
         Task { index, measurement, relation, cut, effort, fresh, warm }
@@ -123,6 +125,11 @@ impl Sequence {
     /// Hands in the result at the sensor, `[T, H, W]`, of the measurement that was begun last.
     pub fn finish(&mut self, estimate: ArrayView3<'_, f32>) {
         self.previous = Some(estimate.to_owned());
+    }
+
+    /// Instead of [`Sequence::finish`], of one that diverged: the next begins with nothing of it, and with the weights that networks had at first.
+    pub fn forget(&mut self) {
+        self.forgotten = true;
     }
 }
 
@@ -160,7 +167,10 @@ pub fn run_sequence<N: Network + Denoiser>(
         let before = denoiser.updates().len();
         let outcome =
             solve(denoiser, &task).map_err(|source| Error::Solve { index: task.index, source: Box::new(source) })?;
-        sequence.finish(outcome.estimate.sensor.view());
+        match outcome.stop {
+            StopReason::Diverged => sequence.forget(),
+            _ => sequence.finish(outcome.estimate.sensor.view()),
+        }
         let updates = denoiser.updates()[before..].to_vec();
         solved.push(Solved { outcome, relation: task.relation, warm: task.is_warm(), cut: task.cut, updates });
     }

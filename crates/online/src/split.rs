@@ -241,7 +241,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
         judged_error(
             &judged,
             || next.network.boxed(),
-            |given, then| Ok(next.recipe.solve(given, &mut Relay::new(Some(first), &mut **then))?),
+            |given, then| Ok(next.recipe.solve_to_the_end(given, &mut Relay::new(Some(first), &mut **then))?),
         )
     });
     let taken_over = taken_over.transpose()?;
@@ -326,10 +326,13 @@ fn judging_crops(scenes: &[Scene<'_>], config: &SplitConfig) -> Result<Vec<Crop>
 fn judged_error<N>(
     crops: &[Crop],
     network: impl Fn() -> N + Sync + Send,
-    solve: impl Fn(&Measurement, &mut N) -> Result<Array4<f32>> + Sync,
+    solve: impl Fn(&Measurement, &mut N) -> Result<Option<Array4<f32>>> + Sync,
 ) -> Result<f64> {
-    let error =
-        |net: &mut N, crop: &Crop| -> Result<f64> { Ok(f64::from(crop.loss(solve(&crop.given, net)?.view())?.0)) };
+    let error = |net: &mut N, crop: &Crop| -> Result<f64> {
+        // What diverges predicts nothing, however good that is which it came from.
+        let Some(found) = solve(&crop.given, net)? else { return Ok(f64::INFINITY) };
+        Ok(f64::from(crop.loss(found.view())?.0))
+    };
     let errors = crops.par_iter().map_init(network, error).collect::<Result<Vec<_>>>()?;
     Ok(errors.iter().sum::<f64>() / errors.len() as f64)
 }
@@ -380,8 +383,13 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
             let scene = &scenes[rng.random_range(0..scenes.len())];
             let hide = |judge: bool, u: f64| !judge && u < config.hidden;
             let Some(crop) = scene.crop(config.side, &mut rng, hide) else { return Ok(None) };
-            let calls = (first..recipe.sigmas.len()).collect();
+            let calls: Vec<usize> = (first..recipe.sigmas.len()).collect();
+            let count = calls.len();
             let calls = recipe.record(&crop.given, &mut now.clone(), calls)?;
+            if calls.len() < count {
+                // The solve was given up: a loss that is no number ends the updates.
+                return Ok(Some(Gradients { loss: f32::NAN, of_vars: Vec::new() }));
+            }
             Ok(Some(recipe.gradient(&crop.given, &calls, &self.net, &self.vars, &|v| Ok(crop.loss(v)?))?))
         };
         let lessons = (0..config.crops).into_par_iter().map(lesson).collect::<Result<Vec<_>>>()?;
@@ -406,7 +414,7 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
     /// The error of [`Learner::blended`] at the pixels that judge.
     fn judge(&self, crops: &[Crop], recipe: &Recipe) -> Result<f64> {
         let blended = self.constant(&self.blended()?)?;
-        judged_error(crops, || blended.clone(), |given, net| Ok(recipe.solve(given, net)?))
+        judged_error(crops, || blended.clone(), |given, net| Ok(recipe.solve_to_the_end(given, net)?))
     }
 
     /// The weights between those before and the average of those learned, as a state of the network.

@@ -328,3 +328,23 @@ fn the_iterations_left_are_the_last_of_the_schedule() {
         assert!(online::Sequence::new(SequenceConfig { effort, ..SequenceConfig::default() }).is_err());
     }
 }
+
+#[test]
+fn nothing_is_carried_over_from_what_diverged() {
+    let config = SequenceConfig { reuse: Reuse::CarryOver, ..SequenceConfig::default() };
+    let mut sequence = online::Sequence::new(config).unwrap();
+    let fresh = |task: Task| (task.fresh, task.is_warm());
+    assert_eq!(fresh(sequence.begin(of_square())), (false, false));
+    sequence.finish(moving_square(SHAPE).view());
+    assert_eq!(fresh(sequence.begin(of_square())), (false, true));
+    sequence.forget();
+    assert_eq!(fresh(sequence.begin(of_square())), (true, false));
+    sequence.finish(moving_square(SHAPE).view());
+    assert_eq!(fresh(sequence.begin(of_square())), (false, true));
+}
+
+#[test]
+fn parameters_that_a_network_lacks_are_named() {
+    let config = AdaptConfig { parameters: nets::Parameters::NormAffine, ..CONFIG };
+    assert!(AdaptiveDenoiser::new(net(), config).unwrap_err().to_string().contains("batch norm"));
+}

@@ -168,3 +168,22 @@ fn where_nothing_can_judge_it_says_so() {
     let result = adapt_by_splitting(&mut net(1), &[one], &recipe(), None, &CONFIG, &mut |_| ControlFlow::Continue(()));
     assert!(matches!(result, Err(Error::NothingToJudge)), "{result:?}");
 }
+
+/// What a solve came from before it diverged may predict pixels well: that is no merit of the network.
+#[test]
+fn weights_with_which_a_solve_diverges_are_not_kept() {
+    let (mut net, square) = (faint(), measurement(None));
+    let before = bytes(&net);
+    let far = recipe().solve_to_the_end(&square, &mut exploding()).unwrap();
+    assert!(far.is_none() && recipe().solve(&square, &mut exploding()).is_ok());
+    let record = adapt(&mut net, &square, &SplitConfig { learning_rate: 1e6, every: 2, ..CONFIG });
+    assert!(record.kept == 0 && bytes(&net) == before, "{record:?}");
+}
+
+/// It makes what it is given a thousand times as bright.
+fn exploding() -> Ffdnet {
+    let mut net = net(1);
+    let loud = net.state().into_iter().map(|(name, t)| (name, t.affine(1e4, 0.0).unwrap())).collect();
+    net.set_state(&loud).unwrap();
+    net
+}

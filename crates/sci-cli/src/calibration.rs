@@ -12,17 +12,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::io::defects::{Defect, LeftOut};
 use crate::io::read_file;
-use crate::io::scene::Scene;
 use crate::io::scene::field::median;
+use crate::io::scene::{HARDLY_OPEN, Scene};
 
 /// The version of the file.
 const SCHEMA: u32 = 1;
 /// Measurements that are looked at, at most: each makes every try so much longer.
 const MOST_MEASUREMENTS: usize = 3;
 
-/// Pixels that masks open for less than this share of the usual are left out: their light is little beside what is not known of the masks,
-/// and divided by as little.
-const HARDLY_OPEN: f32 = 0.2;
+/// Share of the held-out pixels' power that is not predicted, from which on masks may be of another camera, or mirrored: .06 then, .001 to .004 on
+/// captures, .02 with noise of σ = 50.
+const DOUBTFUL: f64 = 0.04;
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -44,6 +44,9 @@ pub struct Calibration {
     ends: [f64; 2],
     /// To be taken off the measurements, in units of white.
     black: f64,
+    /// What white is in the numbers of the file that it was found in; another capture has another. Nothing in calibrations of before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    white: Option<f64>,
     /// Light before the first frame, of each frame, and after the last; nothing where all frames get as much.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     exposure: Option<Vec<f64>>,
@@ -98,7 +101,7 @@ pub fn find(
     let chosen: Vec<Array2<f32>> =
         measurements.iter().take(MOST_MEASUREMENTS).map(|&k| scene.y(k).to_owned()).collect();
     let found = settings.find(&masks, scene.cfa, &chosen, &mut |progress| watch(progress.solves, progress.expected));
-    Ok(Calibration::of(found.context("calibration")?))
+    Ok(Calibration::of(found.context("calibration")?, scene.white()))
 }
 
 /// The masks of a scene, those at pixels that are left out with them.
@@ -113,7 +116,7 @@ fn masks_told(scene: &Scene) -> anyhow::Result<MaskStack> {
 }
 
 impl Calibration {
-    fn of(found: admm::Calibrated) -> Self {
+    fn of(found: admm::Calibrated, white: f32) -> Self {
         let MaskMismatch { shift, rotation, scale, blur, clock, contrast, ends } = found.mismatch;
         let parameters = found.parameters.into_iter().map(|p| Parameter {
             name: p.name.to_owned(),
@@ -133,6 +136,7 @@ impl Calibration {
             contrast,
             ends,
             black: found.black,
+            white: Some(f64::from(white)),
             exposure_uncertainty: found.exposure.as_ref().map(|e| e.uncertainty),
             exposure: found.exposure.map(|e| e.gains),
             error_before: found.error[0],
@@ -147,6 +151,8 @@ impl Calibration {
     /// # Errors
     /// Names the file and what is wrong with it.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
+        // The folder that `sci calibrate` wrote it to means it.
+        let path = if path.is_dir() { &path.join("calibration.json") } else { path };
         let read = || -> anyhow::Result<Self> {
             let found: Self = serde_json::from_slice(&read_file(path)?)?;
             anyhow::ensure!(found.schema == SCHEMA, "its schema is {}, expected {SCHEMA}", found.schema);
@@ -175,6 +181,10 @@ impl Calibration {
     /// # Errors
     /// If nothing of them is left open.
     pub fn masks(&self, scene: &Scene) -> anyhow::Result<MaskStack> {
+        if let Some(gains) = self.exposure.as_ref().filter(|gains| gains.len() != scene.frames() + 2) {
+            let (found, frames) = (gains.len().saturating_sub(2), scene.frames());
+            anyhow::bail!("data.calibration: it is of {found} frames a measurement, the scene has {frames}");
+        }
         let mismatch = self.mismatch();
         let moved = mismatch.apply(&masks_told(scene)?)?;
         let mut known = mismatch.reach(moved.shape().image_dim());
@@ -199,7 +209,8 @@ impl Calibration {
     /// As [`Calibration::masks`].
     pub fn apply(&self, scene: &mut Scene) -> anyhow::Result<()> {
         scene.operator = Arc::new(MaskOperator::new(self.masks(scene)?));
-        let black = self.black as f32;
+        // The level is the sensor's, white the capture's.
+        let black = (self.black * self.white.map_or(1.0, |white| white / f64::from(scene.white()))) as f32;
         scene.measurements -= black;
         scene.clip = scene.clip.map(|level| level - black);
         Ok(())
@@ -212,12 +223,20 @@ impl Calibration {
                 Some(uncertainty) => format!("{:9.4} ± {uncertainty:.4}", p.value),
                 None => format!("{:9.4}   (not told by the measurements)", p.value),
             };
-            let remark = match (p.at_end, p.told_apart) {
-                (true, _) => {
-                    "   at the end of what was looked at: it may lie further off; for shifts see --reach of sci calibrate"
+            let remark = match (p.at_end, p.told_apart, self.white) {
+                (true, ..) if p.name.starts_with("shift") => {
+                    "   at the end of what was looked at: it may lie further off, see --reach of sci calibrate"
+                        .to_owned()
                 }
-                (false, true) => "",
-                (false, false) => "   as told",
+                (true, ..) => "   at the end of what was looked at: it may lie further off".to_owned(),
+                (false, true, Some(white)) if p.name == "black level" => {
+                    format!(
+                        "   of the mean; in the numbers of the file {:.4}, beside data.sensor.black",
+                        self.black * white
+                    )
+                }
+                (false, true, _) => String::new(),
+                (false, false, _) => "   as told".to_owned(),
             };
             format!("{:<12} {value}{remark}", p.name)
         };
@@ -226,6 +245,61 @@ impl Calibration {
             let uncertainty = self.exposure_uncertainty.unwrap_or(0.0);
             format!("{:<12} {} ± {uncertainty:.2} (before, of each frame, after)", "light", gains.join(" "))
         });
-        self.parameters.iter().map(line).chain(exposure).collect()
+        let doubt = (self.error_after > DOUBTFUL).then(|| {
+            format!(
+                "{:.0} % of what held-out pixels measure is not predicted, with the masks as found: do masks and measurements belong together?",
+                100.0 * self.error_after
+            )
+        });
+        self.parameters.iter().map(line).chain(exposure).chain(doubt).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::samples::{Array, SampleType, Samples};
+    use crate::io::scene::{Arrays, Reading, of_arrays};
+
+    /// A scene whose white is this number.
+    fn scene(white: f32) -> Scene {
+        let array = |shape: [usize; 3], value: f32| {
+            let values = (0..shape.iter().product())
+                .map(|i| if shape[0] > 1 { ((i * 7 + i / 8) % 3 % 2) as f32 } else { value });
+            Array::new(shape.to_vec(), Samples::Floats(values.collect()), SampleType::F32).unwrap()
+        };
+        let arrays = Arrays { mask: array([4, 8, 8], 1.0), meas: Some(array([1, 8, 8], white)), truth: None };
+        of_arrays(arrays, &Reading { scale: Some(white), ..Reading::default() }).unwrap()
+    }
+
+    fn calibration(more: &str) -> Calibration {
+        let text = format!(
+            r#"{{"schema": 1, "shift": [0, 0], "rotation": 0, "scale": 1, "clock": 0, "contrast": 1, "ends": [0, 0], "black": 0.1,
+            "error_before": 0.1, "error_after": 0.1, "parameters": [], "solves": 1{more}}}"#
+        );
+        serde_json::from_str(&text).unwrap()
+    }
+
+    #[test]
+    fn a_black_level_is_the_sensors_whatever_white_is() {
+        for (more, white, expected) in
+            [("", 50.0, 0.9), (r#", "white": 100.0"#, 50.0, 0.8), (r#", "white": 100.0"#, 100.0, 0.9)]
+        {
+            let mut scene = scene(white);
+            calibration(more).apply(&mut scene).unwrap();
+            assert!(
+                scene.measurements.iter().all(|y| (y - expected).abs() < 1e-6),
+                "{more} {white}: {}",
+                scene.measurements
+            );
+        }
+    }
+
+    #[test]
+    fn a_calibration_of_other_frames_is_refused_and_one_that_tells_little_doubted() {
+        let other = calibration(r#", "exposure": [0, 1, 1, 0]"#);
+        let error = other.masks(&scene(1.0)).unwrap_err().to_string();
+        assert_eq!(error, "data.calibration: it is of 2 frames a measurement, the scene has 4");
+        assert!(other.lines().last().unwrap().contains("belong together"));
     }
 }

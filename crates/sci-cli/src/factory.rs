@@ -13,7 +13,7 @@ use sci_forward::{CfaPattern, Measurement};
 use crate::config::{Experiment, Stage};
 use crate::io::scene::Scene;
 use crate::parts::{Built, Learning, MultiplyAdds, Saving, Sensor, Site, Work};
-use crate::record::{Adaptation, host};
+use crate::record::{Adaptation, MeasurementRecord, Stop, host};
 use crate::solvers::{self, Priors};
 
 /// Builds the solvers of one experiment.
@@ -93,7 +93,10 @@ impl<'e> Factory<'e> {
         };
         let (outcome, work) = self.run(&measurement, start, &plan, observer)?;
         if let Some(sequence) = &mut self.sequence {
-            sequence.finish(outcome.estimate.sensor.view());
+            match outcome.stop {
+                admm::StopReason::Diverged => sequence.forget(),
+                _ => sequence.finish(outcome.estimate.sensor.view()),
+            }
         }
         let new: Vec<Vec<Update>> =
             self.learning().zip(done).map(|((net, _), done)| net.updates()[done..].to_vec()).collect();
@@ -274,11 +277,14 @@ impl<'e> Factory<'e> {
         scene: &Scene,
         k: usize,
         sensor: Option<ArrayView3<'_, f32>>,
-        adaptation: Option<&Adaptation>,
+        record: &MeasurementRecord,
     ) -> anyhow::Result<()> {
         self.begin(&scene.measurement(k)?)?;
-        if let (Some(sequence), Some(sensor)) = (&mut self.sequence, sensor) {
-            sequence.finish(sensor);
+        let adaptation = record.online.as_ref();
+        match (&mut self.sequence, sensor) {
+            (Some(sequence), _) if record.stop == Stop::Diverged => sequence.forget(),
+            (Some(sequence), Some(sensor)) => sequence.finish(sensor),
+            _ => {}
         }
         if let Some(split) = adaptation.and_then(|a| a.split.as_ref()) {
             self.ends_early = split.ends_early;

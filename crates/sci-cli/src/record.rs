@@ -28,8 +28,14 @@ pub struct Record {
     pub denoiser: String,
     /// One entry for each measurement, in the order they were solved.
     pub measurements: Vec<MeasurementRecord>,
+    /// How many more were to be solved when the run was stopped; also one whose solve was stopped. 0 of a complete run.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub unsolved: usize,
     /// Means over `measurements`.
     pub mean: MeanRecord,
+    /// What looked odd about the data, and what was taken for white, clipped or defective.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
     /// The process's largest resident memory in bytes; 0 where the system does not tell.
     pub peak_rss_bytes: u64,
     /// Worker threads.
@@ -67,6 +73,11 @@ pub struct Record {
     /// The resolved experiment: paths absolute, defaults filled in. `written` is what it was read from: `file`, its `text`,
     /// what it `extends` and the `--set`s.
     pub config: serde_json::Value,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // as serde calls it
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 /// Where a shard of a run was solved.

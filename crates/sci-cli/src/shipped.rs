@@ -40,6 +40,20 @@ pub fn located(path: &Path) -> PathBuf {
     }
 }
 
+/// What may be meant by the path of a file that is not there, for a message: nothing if it is not like a name.
+pub fn like(path: &Path) -> String {
+    let Some(text) = path.to_str().filter(|text| !text.ends_with(".toml") && !text.contains('\\')) else {
+        return String::new();
+    };
+    let last = |name: &str| name.rsplit_once('/').map_or(name, |(_, last)| last).to_owned();
+    let near = |name: &&str| strsim::damerau_levenshtein(name, text) <= 2 || last(name) == text;
+    let near: Vec<&str> = names().filter(near).collect();
+    if near.is_empty() {
+        return format!("; the experiments that come with the program are {}", names().collect::<Vec<_>>().join(", "));
+    }
+    format!(" (did you mean {}?)", near.join(" or "))
+}
+
 /// Whether a path is that of something shipped, not of a file.
 pub fn is_shipped(path: &Path) -> bool {
     path.to_str().is_some_and(|path| path.starts_with(PREFIX))
@@ -95,5 +109,12 @@ mod tests {
         assert_eq!(text("bundled:real/../gray/default.toml".as_ref()), Some(default));
         assert_eq!(text("bundled:gray/none.toml".as_ref()), None);
         assert_eq!(text("gray/default.toml".as_ref()), None);
+    }
+
+    #[test]
+    fn a_name_that_is_nearly_one_is_told_what_it_may_mean() {
+        assert_eq!(like("gray/fats".as_ref()), " (did you mean gray/fast?)");
+        assert_eq!(like("fast".as_ref()), " (did you mean color/fast or gray/fast?)");
+        assert!(like("mine".as_ref()).contains("come with the program are") && like("mine.toml".as_ref()).is_empty());
     }
 }

@@ -14,7 +14,7 @@ use sci_cli::table::{Paths, Source, Table};
 use sci_forward::CfaPattern;
 
 use crate::arrays::{array, floats, out, row_major};
-use crate::failure::{callers, raised, refused};
+use crate::failure::{callers, in_units_of_white, raised, refused};
 use crate::settings;
 
 /// A denoiser of the program, for its solvers and for loops of your own: denoiser(noisy, sigma).
@@ -128,10 +128,7 @@ impl Denoiser {
             Some(_) if !self.has_sigma => {
                 Err(refused(format!("{} has a strength of its own, and no sigma", self.kind)))
             }
-            Some(sigma) if !(0.0..=1.0).contains(&sigma) => {
-                Err(refused(format!("sigma = {sigma} is not legal; legal: 0 to 1 (25 / 255, not 25)")))
-            }
-            sigma => Ok(sigma),
+            sigma => sigma.map(|sigma| in_units_of_white("sigma", f64::from(sigma)).map(|()| sigma)).transpose(),
         }
     }
 

@@ -26,6 +26,14 @@ pub(crate) fn raised(error: anyhow::Error) -> PyErr {
     }
 }
 
+/// That a standard deviation is in units of white.
+pub(crate) fn in_units_of_white(name: &str, sigma: f64) -> PyResult<()> {
+    match (0.0..=1.0).contains(&sigma) {
+        true => Ok(()),
+        false => Err(refused(format!("{name} = {sigma} is not legal; legal: 0 to 1 (25 / 255, not 25)"))),
+    }
+}
+
 /// Says with an exception that came from Python where in the solve that was.
 fn noted(py: Python<'_>, raised: PyErr, error: &anyhow::Error) -> PyErr {
     let value = raised.value(py);

@@ -12,7 +12,7 @@ use sci_cli::simulate::Camera;
 use sci_forward::{CfaPattern, MaskStack, Noise, SensingOperator, VideoShape};
 
 use crate::arrays::{array, must_be, out, row_major};
-use crate::failure::{raised, refused};
+use crate::failure::{in_units_of_white, raised, refused};
 use crate::settings;
 
 const VIDEO: &str = "[T, H, W]";
@@ -200,6 +200,7 @@ pub(crate) fn simulate<'py>(
         _ => None,
     };
     let truth = truth.ok_or_else(|| refused(format!("`video` has shape {shape:?}, expected {AXES}")))?;
+    in_units_of_white("sigma", sigma)?;
     let noise = Noise::new(photons, sigma).map_err(|e| raised(e.into()))?;
     let (optics, readout) = of_arguments(&settings::arguments(camera)?, noise).map_err(|e| raised(e.into()))?;
     let camera = Camera { optics, readout, seed };

@@ -16,7 +16,7 @@ use sci_forward::{BoxError, CfaPattern, Demosaicer, Measurement, Noise};
 
 use crate::arrays::{array, out, row_major};
 use crate::denoisers::Plugged;
-use crate::failure::{Refused, raised, refused};
+use crate::failure::{Refused, in_units_of_white, raised, refused};
 use crate::operator::{operator, pattern};
 use crate::pool::{self, Stop};
 
@@ -187,6 +187,15 @@ impl Solver {
     ) -> PyResult<(Bound<'py, PyArrayDyn<f32>>, Bound<'py, PyDict>)> {
         let cfa = pattern(cfa)?;
         let y = row_major(array::<Ix2>("measurement", measurement, "[H, W]")?.as_array()).into_owned();
+        if let Some(sigma) =
+            stages.iter().filter_map(|stage| stage.0).find(|sigma| !(*sigma >= 0.0 && sigma.is_finite()))
+        {
+            return Err(refused(format!("sigma = {sigma} of a stage is not legal; legal: 0 or more, or None")));
+        }
+        noise.map_or(Ok(()), |noise| in_units_of_white("noise", noise))?;
+        if let Some(clip) = clip.filter(|clip| !(*clip > 0.0 && clip.is_finite())) {
+            return Err(refused(format!("clip = {clip} is not legal; legal: a number above 0")));
+        }
         let noise = noise.map(|sigma| Noise::new(None, sigma)).transpose().map_err(|e| raised(e.into()))?;
         let measurement = Measurement::new(operator(masks)?, y).map_err(|e| raised(e.into()))?;
         let measurement = measurement.with_cfa(cfa).with_noise(noise).with_clip(clip);

@@ -84,7 +84,8 @@ pub(super) fn read(path: &Path) -> Result<(Meta, BTreeMap<String, Tensor>)> {
 }
 
 /// What may differ in a run that goes on: where its data lies, and how it is watched and saved.
-const FREE: [&str; 5] = ["data.video", "data.photos", "data.validation", "validation", "checkpoint"];
+const FREE: [&str; 6] =
+    ["data.video", "data.photos", "data.validation", "iterates.first.weights", "validation", "checkpoint"];
 
 /// Refuses to go on with settings that would make another run of it.
 pub(super) fn check_same_run(path: &Path, saved: &TrainConfig, now: &TrainConfig) -> Result<()> {

@@ -474,7 +474,7 @@ impl TrainConfig {
         let legal = "two shares above 0 and at most 1, the lower first";
         check(density, "camera.density", format_args!("[{thin}, {dense}]"), legal)?;
         check(!masks.is_empty(), "camera.masks", "none", "at least one kind")?;
-        check(level(*noise), "camera.noise", noise, LEVELS)?;
+        check(level(*noise), "camera.noise", noise, "0 to 255")?;
         check((0.0..=0.5).contains(holes), "camera.holes", holes, "0 to 0.5")?;
         check((0.0..=1.0).contains(saturated), "camera.saturated", saturated, "0 to 1")?;
         check((0.0..=1.0).contains(mask_errors), "camera.mask_errors", mask_errors, "0 to 1")?;
@@ -486,7 +486,12 @@ impl TrainConfig {
 
     fn validate_iterates(&self, iterates: &IteratesConfig) -> Result<()> {
         let IteratesConfig { first, sigmas, start_iterations, calls, unrolled: _ } = iterates;
-        check(!matches!(self.network, NetworkConfig::Ddnet { .. }), "iterates", "ddnet", "ffdnet and fastdvdnet")?;
+        check(
+            !matches!(self.network, NetworkConfig::Ddnet { .. }),
+            "iterates",
+            "ddnet",
+            "ffdnet, fastdvdnet and shiftnet",
+        )?;
         let levels = |key, sigmas: &[f32]| {
             let holds = !sigmas.is_empty() && sigmas.iter().all(|&s| level(s));
             check(holds, key, format_args!("{sigmas:?}"), "at least one, each 0 to 255")

@@ -59,9 +59,11 @@ impl Idle {
     /// Counts a step with these gradients.
     pub(super) fn count(&mut self, gradients: &[Option<Vec<f32>>]) {
         for Layer { weight, bias, outputs, inputs, .. } in &mut self.layers {
+            // An expert that was not asked in this step is not idle.
+            let Some(of_weight) = &gradients[*weight] else { continue };
             let bias = bias.and_then(|bias| gradients[bias].as_ref());
             let (mut made, mut taken) = (vec![false; outputs.len()], vec![false; inputs.len()]);
-            for (i, filter) in gradients[*weight].iter().flat_map(|weight| weight.chunks_exact(TAPS)).enumerate() {
+            for (i, filter) in of_weight.chunks_exact(TAPS).enumerate() {
                 let moves = filter.iter().any(|&g| g != 0.0);
                 made[i / inputs.len()] |= moves;
                 taken[i % inputs.len()] |= moves;

@@ -251,6 +251,10 @@ impl Trainer {
             let mut model = model.boxed();
             let mut denoiser = settings.relay(self.first.as_deref(), &mut *model);
             let calls = settings.record(&measurement, &mut denoiser, &mut rng)?;
+            if calls.len() < settings.calls {
+                // The solve was given up.
+                return Err(Error::Diverged { step: self.step + 1, loss: f32::NAN });
+            }
             if settings.unrolled {
                 return Ok(vec![Lesson::Unrolled { measurement: Box::new(measurement), clean: clip, calls }]);
             }
@@ -349,15 +353,17 @@ impl Trainer {
         Variables { weight: &self.vars[weight].1, bias: bias.map(|bias| &self.vars[bias].1) }
     }
 
-    /// The model after a pass of what a lesson begins with, in which it noted the means.
+    /// The model after a pass of a lesson, in which each layer noted the means of what it is given first.
     fn watched(&self, lesson: &Lesson) -> Result<Box<dyn Network>> {
         let mut watched = self.model.boxed();
         watched.convs_mut().into_iter().for_each(Conv::watch);
         match lesson {
             Lesson::Batch(Batch { seen, sigmas, .. }) => drop(watched.forward(seen, sigmas)?),
+            // Experts for a lower σ come in later calls.
             Lesson::Unrolled { calls, .. } => {
-                let first = &calls[0];
-                drop(watched.forward(&tensor(first.input.clone())?, &[first.sigma])?);
+                for call in calls {
+                    watched.forward(&tensor(call.input.clone())?, &[call.sigma])?;
+                }
             }
         }
         Ok(watched)
@@ -539,6 +545,8 @@ impl Trainer {
                 let before = checkpoint::previous(path);
                 let Ok(found) = checkpoint::read(&before) else { return Err(error) };
                 self.restore(&before, found)?;
+                // The next one to be saved would put it in the place of this one.
+                std::fs::remove_file(path).map_err(|source| Error::Write { path: path.to_owned(), source })?;
                 Ok(Resumed { from: before, refused: Some(error) })
             }
         }
@@ -584,7 +592,10 @@ impl Trainer {
         let mut centres = Vec::new();
         for (weight, bias) in self.idle.layers().filter(|_| meta.step > 0) {
             let Some(inputs) = self.adam.centred_inputs(weight) else { continue };
-            centres.push((weight, Centre { bias, means: take("means", &self.vars[weight].0, &[inputs])? }));
+            // What no lesson has reached has none.
+            if let Ok(means) = take("means", &self.vars[weight].0, &[inputs]) {
+                centres.push((weight, Centre { bias, means }));
+            }
         }
         // Only now that all is there does anything change.
         for ((_, var), weights) in self.vars.iter().zip(weights) {

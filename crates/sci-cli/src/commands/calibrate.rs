@@ -8,7 +8,7 @@ use ndarray::Axis;
 use plotters::prelude::*;
 
 use super::run::{say, scene_and_choice};
-use super::{Done, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
+use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown_on_a_bar};
 use crate::calibration::{self, Calibration, Parameter};
 use crate::config;
 use crate::io::output::{ArrayFormat, Part, write_arrays, write_atomically};
@@ -48,6 +48,14 @@ impl Args {
         let out = self.out.clone().unwrap_or_else(default);
         refuse_inputs(&out, &experiment.inputs())?;
         check_folder(&out)?;
+        if let Some(foreign) = FILES.map(|name| out.join(name)).iter().find(|file| file.exists())
+            && !out.join(JSON).exists()
+        {
+            anyhow::bail!(UsageError(format!(
+                "--out: {} is there, but no {JSON} with it: it is not of a calibration and would be replaced; name another folder",
+                foreign.display()
+            )));
+        }
         catch_interrupts()?;
         let (mut scene, chosen) = scene_and_choice(&experiment)?;
         let Self { reach, clock, .. } = self;
@@ -59,21 +67,25 @@ impl Args {
         std::fs::create_dir_all(&out).with_context(|| format!("cannot make {}", out.display()))?;
         let masks = found.masks(&scene)?;
         let part = Part { name: "mask", data: masks.view().insert_axis(Axis(1)), is_light: false };
-        write_arrays(&out.join("masks.npy"), ArrayFormat::Npy, &[part])?;
+        write_arrays(&out.join(FILES[0]), ArrayFormat::Npy, &[part])?;
         let mut svg = String::new();
         draw(&mut svg, &found).map_err(|e| anyhow!("cannot draw the curves: {e}"))?;
-        write_atomically(&out.join("calibration.svg"), |w| w.write_all(svg.as_bytes()))?;
+        write_atomically(&out.join(FILES[1]), |w| w.write_all(svg.as_bytes()))?;
         // Last: where it is, the others are.
-        write_atomically(&out.join("calibration.json"), |w| w.write_all(found.to_json().as_bytes()))?;
+        write_atomically(&out.join(JSON), |w| w.write_all(found.to_json().as_bytes()))?;
         found.lines().iter().for_each(|line| outln!("{line}"));
         found.apply(&mut scene)?;
         scene.look_for_defects(experiment.data.reading.defects)?.iter().for_each(|note| say(&experiment, note));
         let Calibration { error_before, error_after, solves, .. } = found;
         outln!("held-out error {error_before:.3e} -> {error_after:.3e} after {solves} tries");
-        outln!("wrote {0}; use it by --set data.calibration={0}/calibration.json", out.display());
+        outln!("wrote {0}; use it by --set data.calibration={0}/{JSON}", out.display());
         Ok(Done::Complete)
     }
 }
+
+/// What is written beside [`JSON`].
+const FILES: [&str; 2] = ["masks.npy", "calibration.svg"];
+const JSON: &str = "calibration.json";
 
 const COLUMNS: usize = 3;
 const CELL: (u32, u32) = (320, 240);

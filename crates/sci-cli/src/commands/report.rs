@@ -86,6 +86,9 @@ fn print_table(records: &[Record]) {
             r.mean.seconds,
             r.mean.iterations
         );
+        if r.unsolved > 0 {
+            outln!("{:width$}  stopped: {} more measurements were to be solved", "", r.unsolved);
+        }
     }
 }
 

@@ -21,6 +21,7 @@ use super::{Done, UsageError, catch_interrupts, check_folder, interrupted, shown
 use crate::calibration::Calibration;
 use crate::config::{self, Experiment, MaskSource, RandomMask, Simulate};
 use crate::factory::Factory;
+use crate::io::frames;
 use crate::io::scene::{self, Scene, Truth};
 use crate::pictures::Studio;
 use crate::record::host;
@@ -81,7 +82,9 @@ impl Args {
         };
         let (calibration, note) = calibration.unzip();
         calibration.iter().flat_map(Calibration::lines).for_each(|line| outln!("{line}"));
-        note.flatten().iter().for_each(|note| say(&experiment, note));
+        let note = note.flatten();
+        note.iter().for_each(|note| say(&experiment, note));
+        let warnings = subject.warnings().iter().chain(&note).cloned().collect();
         let mut factory = Factory::new(&experiment, subject.cfa())?;
         let layout = layout_of(&experiment, &subject, &factory);
         let all = [chosen.len() * layout.shape[0], layout.shape[1], layout.shape[2], layout.shape[3]];
@@ -106,6 +109,7 @@ impl Args {
             begin,
             calibration,
             checksums: plan.identity["checksums"].clone(),
+            warnings,
             count: own.len(),
         };
         let done = solved.and_then(|()| match shard {
@@ -245,13 +249,16 @@ fn checksums_of_files(experiment: &Experiment, subject: &Subject) -> anyhow::Res
     Ok(serde_json::Value::Object(sums.collect()))
 }
 
-/// The file itself, or the arrays of a folder; nothing of a pipe, which cannot be read twice.
+/// The file itself, or the arrays of a folder, or its pictures; nothing of a pipe, which cannot be read twice.
 fn files_of(path: &Path) -> io::Result<Vec<PathBuf>> {
     if !path.is_dir() {
         return Ok(Some(path.to_owned()).filter(|path| path.is_file()).into_iter().collect());
     }
     let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
     files.retain(|file| file.is_file() && file.extension().is_some_and(|e| e == "npy"));
+    if files.is_empty() {
+        return frames::list(path).map_err(io::Error::other);
+    }
     files.sort();
     Ok(files)
 }

@@ -131,7 +131,7 @@ fn mask_shift(t: &mut Table<'_>, simulated: bool) -> Option<MaskShift> {
         t.idle(&["frames"], "data.mask_shift, by which one mask moves: two numbers from -64 to 64, for example [1, 0]");
         return None;
     }
-    let legal = "two numbers from -64 to 64, the pixels down and right from a frame to the next, for example [1, 0]";
+    let legal = "two numbers from -64 to 64: frame t sees the mask at row y + t dy, column x + t dx, for example [1, 0] of a mask whose image moves up";
     let step = t.legal("mask_shift", legal, |v| camera::pair(v, 64.0));
     t.show("mask_shift", step.map(|step| json!(step)));
     Some(MaskShift { step: step.unwrap_or_default(), frames: t.required_whole("frames", 2..=1024) })
@@ -163,7 +163,7 @@ fn sensor(t: &mut Table<'_>, simulated: bool) -> Sensor {
     if simulated {
         t.idle(&["dark", "white"], "data.kind = \"scene\": a simulated sensor has data.sensor.black");
     } else if t.holds("dark") {
-        t.idle(&["black"], "another black level than that of data.sensor.dark");
+        t.idle(&["black"], "a file without data.sensor.dark, which has the black level of each pixel");
     }
     let frame = |t: &mut Table<'_>, key: &str| if t.holds(key) { Some(t.path(key)) } else { None };
     let (dark, white) = (frame(t, "dark"), frame(t, "white"));

@@ -143,9 +143,17 @@ pub fn exclude(defects: &[Defect], masks: &mut Array3<f32>, measurements: &mut A
 /// A sentence on defects, and on what is done about them; nothing where there are none.
 pub fn note(defects: &[Defect], wish: Defects) -> Option<String> {
     named(defects).map(|named| match wish {
-        Defects::Exclude => format!("pixels left out as not measured: {named}"),
-        Defects::Keep => format!("pixels look defective: {named}; data.defects = \"exclude\" leaves them out"),
+        Defects::Exclude => format!("{LEFT_OUT}{named}"),
+        Defects::Keep => format!("{DEFECTIVE}{named}; data.defects = \"exclude\" leaves them out"),
     })
+}
+
+const LEFT_OUT: &str = "pixels left out as not measured: ";
+const DEFECTIVE: &str = "pixels look defective: ";
+
+/// Whether a sentence is one of [`note`].
+pub fn is_note(sentence: &str) -> bool {
+    sentence.starts_with(LEFT_OUT) || sentence.starts_with(DEFECTIVE)
 }
 
 /// Names them: how many of each kind, and where the first are. `None` if there are none.

@@ -85,11 +85,11 @@ fn open_file(path: &Path) -> Result<Hdf5File, ReadError> {
     Hdf5File::open_with_options(path, options(limit)).map_err(bad)
 }
 
-/// The arrays of plain real numbers in a file, with their shapes and types, and whether MATLAB wrote them.
+/// The arrays of plain real numbers in a file, with their shapes and types, whether parts of them can be read, and whether MATLAB wrote them.
 ///
 /// # Errors
 /// [`ReadError`] for damaged bytes.
-pub(super) fn headers(path: &Path) -> Result<(Vec<(String, Header)>, bool), ReadError> {
+pub(super) fn headers(path: &Path) -> Result<(Vec<(String, Header, bool)>, bool), ReadError> {
     let file = open_file(path)?;
     let root = file.root_group().map_err(bad)?;
     let mut names = Vec::new();
@@ -101,7 +101,8 @@ pub(super) fn headers(path: &Path) -> Result<(Vec<(String, Header)>, bool), Read
         let Some((kind, _, 1)) = numbers(data.dtype()) else { continue };
         let shape: Option<Vec<usize>> = data.shape().iter().map(|&d| usize::try_from(d).ok()).collect();
         if let Some(shape) = shape.filter(|shape| element_count(shape).is_some()) {
-            found.push((name, Header::plain(shape, kind)));
+            let in_parts = kind != SampleType::F16 && !matches!(data.dtype(), Datatype::Enum { .. });
+            found.push((name, Header::plain(shape, kind), in_parts));
         }
     }
     Ok((found, of_matlab))

@@ -171,6 +171,8 @@ struct Head {
 
 const CELL: u32 = 1;
 const STRUCT: u32 = 2;
+/// Strings, tables and other objects of MATLAB, which say neither a size nor, here, a name.
+const OPAQUE: u32 = 17;
 /// From double to uint64.
 const NUMERIC: std::ops::RangeInclusive<u32> = 6..=15;
 
@@ -182,6 +184,9 @@ impl Head {
             return Err(bad("a variable does not begin with its array flags"));
         }
         let flags = word(&flags[..4], endian);
+        if flags & 0xff == OPAQUE {
+            return Ok(Self { class: OPAQUE, complex: false, shape: Vec::new(), name: String::new() });
+        }
         let (kind, dims) = subelement(&mut r, endian, 4 * MAX_DIMS)?;
         if kind != MI_INT32 || dims.len() < 8 {
             return Err(bad("a variable without dimensions"));
@@ -627,5 +632,27 @@ mod tests {
                 let _ = read(&b, &wanted);
             }
         }
+    }
+
+    /// A string, which says neither its size nor, where others have it, its name.
+    #[test]
+    fn an_object_of_matlab_is_passed_over() {
+        let plain = sample();
+        let mut body = Vec::new();
+        for (kind, data) in
+            [(MI_UINT32, [OPAQUE, 0].map(u32::to_le_bytes).concat()), (MI_INT8, b"note\0\0\0\0".to_vec())]
+        {
+            body.extend(kind.to_le_bytes());
+            body.extend((data.len() as u32).to_le_bytes());
+            body.extend(data);
+        }
+        let object = [14u32.to_le_bytes().to_vec(), (body.len() as u32).to_le_bytes().to_vec(), body].concat();
+        let with = [&plain[..HEADER_LEN], &object, &plain[HEADER_LEN..]].concat();
+        let found = read(&with, &["orig"]).unwrap();
+        assert!(
+            found.arrays["orig"].shape() == [4, 3, 2] && found.names.contains(&"other".to_owned()),
+            "{:?}",
+            found.names
+        );
     }
 }

@@ -273,6 +273,30 @@ impl Array {
         }
     }
 
+    /// Parts of an array, one after the other along an axis.
+    ///
+    /// # Panics
+    /// If there is no part, or they do not fit together.
+    pub fn joined(parts: &[Self], axis: usize) -> Self {
+        let first = &parts[0];
+        let outer: usize = first.shape[..axis].iter().product();
+        let inner: usize = first.shape[axis + 1..].iter().product();
+        let mut shape = first.shape.clone();
+        shape[axis] = parts.iter().map(|part| part.shape[axis]).sum();
+        let row = |part: &Self, row: usize| {
+            let length = part.shape[axis] * inner;
+            part.samples.in_order(&[row], length)
+        };
+        let mut samples = match first.samples {
+            Samples::Bytes(_) => Samples::Bytes(Vec::new()),
+            Samples::Floats(_) => Samples::Floats(Vec::new()),
+        };
+        samples.reserve_exact(shape.iter().product());
+        (0..outer).for_each(|k| parts.iter().for_each(|part| samples.append(row(part, k))));
+        assert_eq!(samples.len(), shape.iter().product::<usize>(), "parts of one array");
+        Self { shape, samples, stored: first.stored, white: first.white }
+    }
+
     /// The arrays of a cell array, all of one size, one after the other along a new first axis.
     ///
     /// # Errors

@@ -32,6 +32,8 @@ enum Place {
     Unpacked(Arc<Mutex<File>>),
     /// A dataset.
     Dataset(String),
+    /// One of a type of which parts cannot be read.
+    Whole,
 }
 
 /// The arrays of a file, or of a folder of `.npy` files, and the format that their layout is of.
@@ -66,8 +68,8 @@ pub fn arrays(path: &Path) -> Result<Option<Arrays>, FileError> {
         Ok(Format::Npz) => Ok(Some(Arrays { named: in_archive(path, file).map_err(error)?, format: Format::Npz })),
         Ok(Format::Hdf5 | Format::Mat) if hdf5::is_hdf5(&beginning) => {
             let (found, of_matlab) = hdf5::headers(path).map_err(error)?;
-            let stored = |(name, header): (String, Header)| {
-                let place = Place::Dataset(name.clone());
+            let stored = |(name, header, in_parts): (String, Header, bool)| {
+                let place = if in_parts { Place::Dataset(name.clone()) } else { Place::Whole };
                 (name, Stored { path: path.to_owned(), place, header })
             };
             let format = if of_matlab || hdf5::is_matlab(&beginning) { Format::Mat } else { Format::Hdf5 };
@@ -137,6 +139,11 @@ impl Stored {
         &self.header.shape
     }
 
+    /// Whether parts of it can be read.
+    pub fn in_parts(&self) -> bool {
+        !matches!(self.place, Place::Whole)
+    }
+
     /// Bytes of a sample once it is read.
     pub fn sample_bytes(&self) -> usize {
         self.header.stored.decoded_size()
@@ -156,7 +163,10 @@ impl Stored {
         npy::read_header(&mut member).map_err(error)?;
         let mut unpacked = tempfile::tempfile_in(folder).map_err(|e| FileError::new(folder, ReadError::Io(e)))?;
         let wanted = self.header.bytes();
-        let found = io::copy(&mut member.take(wanted), &mut unpacked).map_err(|e| error(ReadError::Io(e)))?;
+        let copied = io::copy(&mut member.by_ref().take(wanted), &mut unpacked);
+        // The checksum of a member is compared at its end.
+        let found = copied.and_then(|found| io::copy(&mut member, &mut io::sink()).map(|_| found));
+        let found = found.map_err(|e| error(ReadError::Malformed { format: ".npz", reason: e.to_string() }))?;
         if found < wanted {
             return Err(error(self.header.cut_short(found)));
         }
@@ -170,7 +180,7 @@ impl Stored {
     /// The operating system's, and damaged data.
     ///
     /// # Panics
-    /// If the ranges are not within the shape, or it is packed: [`Stored::unpack`] comes first.
+    /// If the ranges are not within the shape, it is packed ([`Stored::unpack`] comes first), or parts of it cannot be read.
     pub fn read(&self, ranges: &[Range<usize>]) -> Result<Array, FileError> {
         assert_eq!(ranges.len(), self.header.shape.len(), "a range for each axis");
         let inside = |(range, &length): (&Range<usize>, &usize)| range.start <= range.end && range.end <= length;
@@ -184,7 +194,7 @@ impl Stored {
             Place::At(start) => File::open(&self.path).and_then(|file| self.picked(ranges, *start, file)),
             // Whoever held it last reads from a place of his own.
             Place::Unpacked(file) => self.picked(ranges, 0, &mut *file.lock().unwrap_or_else(PoisonError::into_inner)),
-            Place::Packed(_) => panic!("a packed member is unpacked before it is read"),
+            Place::Packed(_) | Place::Whole => panic!("a packed member is unpacked before it is read"),
         };
         let shape = ranges.iter().map(ExactSizeIterator::len).collect();
         // What is asked for is what memory there is for.

@@ -314,8 +314,23 @@ function adaptation(measurements) {
       return s.taken_over == null ? rows : [...rows, row("the network after it", undefined, s.taken_over, !s.ends_early)];
     }));
 }
+/** What was found out about the data, or looked odd. */
+function notes(r) {
+  const found = (r.calibration?.parameters ?? []).filter(p => p.told_apart);
+  if (!r.warnings?.length && !r.calibration && !r.unsolved) return;
+  const box = section("The data");
+  if (r.unsolved) put(box, "p", { class: "warning" }, `The run was stopped: ${r.unsolved} more of its measurements were to be solved.`);
+  if (r.calibration) {
+    const { error_before, error_after } = r.calibration;
+    const masks = found.map(p => `${p.name} ${p.value.toFixed(4)}`).join(", ") || "as told";
+    put(box, "p", {}, `Masks, as they were found to sit: ${masks}. Held-out error ${small(error_before)} before, ${small(error_after)} after.`);
+  }
+  const list = put(box, "ul");
+  (r.warnings ?? []).forEach(w => put(list, "li", {}, w));
+}
 function run(r, images) {
   head(r);
+  notes(r);
   if (images.length) viewer(r, images);
   convergence("Convergence", r.measurements.map(m => ({ name: `measurement ${m.index}`, trace: m.trace })));
   table(section("Measurements"),

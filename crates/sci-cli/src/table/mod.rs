@@ -111,8 +111,13 @@ impl<'s> Table<'s> {
     }
 
     /// Whether a key is there that has not been asked for.
-    pub fn holds(&self, key: &str) -> bool {
-        self.rest.contains_key(key)
+    pub fn holds(&mut self, key: &str) -> bool {
+        let place = self.rest.get(key).map(Spanned::span);
+        // Whoever has asked already has taken it.
+        if self.place_of(key).is_none() {
+            self.asked.push((key.to_owned(), place.clone()));
+        }
+        place.is_some()
     }
 
     /// The keys that have not been asked for.
@@ -368,7 +373,7 @@ impl<'s> Table<'s> {
 
     /// Whether a key holds this word where there could be a table.
     pub fn word(&mut self, key: &str, word: &str) -> bool {
-        let found = self.rest.get(key).is_some_and(|value| value.get_ref().as_str() == Some(word));
+        let found = self.holds(key) && self.rest.get(key).is_some_and(|value| value.get_ref().as_str() == Some(word));
         if found {
             self.rest.remove(key);
         }
@@ -417,8 +422,12 @@ impl<'s> Table<'s> {
     }
 
     fn unknown(&self, span: &Range<usize>, key: &str) -> ConfigError {
-        let mut legal: Vec<&str> = self.asked.iter().map(|(name, _)| name.as_str()).collect();
-        legal.dedup();
+        let mut legal: Vec<&str> = Vec::new();
+        for (name, _) in &self.asked {
+            if !legal.contains(&name.as_str()) {
+                legal.push(name);
+            }
+        }
         let distances = legal.iter().map(|l| (strsim::damerau_levenshtein(l, key), l));
         let near = distances.filter(|(distance, _)| *distance <= 2).min();
         let near = near.map_or(String::new(), |(_, l)| format!(" (did you mean `{l}`?)"));
@@ -465,6 +474,11 @@ mod tests {
         assert_eq!(problem("weight = 7\ncounts = 2"), unknown);
         assert_eq!(problem("weight = 7"), "a.toml:1: `weight` = 7 is not legal; legal: a number from 0 to 1");
         assert_eq!(problem("weight = 1"), "a.toml:1: `count` is missing; legal: 1 to 9");
+        // What was only looked for counts too.
+        let source = Source::new("a.toml".as_ref(), "maks = 1", &[], &|_| Err("none".into())).unwrap();
+        let looked =
+            Table::root(&source, Paths::AsWritten).unwrap().read(|t| Ok((t.holds("mask"), t.word("noise", "auto"))));
+        assert!(looked.unwrap_err().to_string().ends_with("`maks` (did you mean `mask`?); legal here: mask, noise"));
         assert_eq!(problem("count = 2\ninner.other = 1"), "a.toml:2: unknown key `inner.other`; legal here: on");
         let (values, json) = read("count = 2", keys).unwrap();
         assert_eq!(values, (0.3, 2, true));

@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::source::{ConfigError, Source};
+use crate::shipped;
 
 /// The environment variable that names a folder of scenes and weights.
 pub const DATA_VARIABLE: &str = "SCI_DATA";
@@ -30,6 +31,8 @@ impl<'t> Written<'t> {
 /// The folders a relative path is looked up in: that of the file which names it, the current one, and those of the data.
 fn search_folders(written: &Written<'_>, source: &Source) -> Vec<PathBuf> {
     let mut folders = vec![source.folder(&written.span), PathBuf::from(".")];
+    // What the program brought lies nowhere.
+    folders.retain(|folder| !shipped::is_shipped(folder));
     folders.dedup();
     if let Some(data) = env::var_os(DATA_VARIABLE).filter(|v| !v.is_empty()).map(PathBuf::from) {
         folders.extend([data.clone(), data.join("data"), data.join("weights")]);
@@ -106,9 +109,10 @@ pub(super) fn locate_weights(written: &Written<'_>, source: &Source) -> Result<P
     locate(written, source).map_err(|mut error| {
         let name = Path::new(written.text).file_name().unwrap_or_default();
         if let Some((name, what)) = PUBLISHED.iter().find(|(n, _)| *n == name) {
+            let beside = search_folders(written, source)[0].join(name);
             error.problem += &format!(
                 ". It is {what}; save it as {} or as weights/{name} in the folder {DATA_VARIABLE} names",
-                source.folder(&written.span).join(name).display()
+                beside.display()
             );
         }
         error

@@ -74,11 +74,15 @@ pub fn read_text(path: &Path, what: &str) -> Result<String, String> {
         File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
         Ok(bytes)
     };
-    let bytes = read().map_err(|e: io::Error| format!("cannot read the {what} file: {e}"))?;
+    let bytes = read().map_err(|e: io::Error| {
+        let known = (e.kind() == io::ErrorKind::NotFound).then(|| shipped::like(path)).unwrap_or_default();
+        format!("cannot read the {what} file: {e}{known}")
+    })?;
     if bytes.len() as u64 > MOST_BYTES {
         return Err(format!("larger than {MOST_BYTES} bytes, no {what} file"));
     }
-    String::from_utf8(bytes).map_err(|_| "not a text file".into())
+    String::from_utf8(bytes)
+        .map_err(|_| format!("not a text file; a scene is named by --set data.path=FILE, after the {what}"))
 }
 
 impl Source {

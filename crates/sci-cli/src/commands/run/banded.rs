@@ -6,6 +6,7 @@ use anyhow::Context;
 use ndarray::{Array3, Array4, Axis};
 use nets::kernels::release_freed_memory;
 use rayon::prelude::*;
+use sci_forward::MaskError;
 use sci_forward::bayer::mosaic_into;
 
 use super::super::interrupted;
@@ -13,7 +14,7 @@ use super::solving::{Bar, line};
 use crate::bands::{Bands, Joined};
 use crate::config::Experiment;
 use crate::factory::Factory;
-use crate::io::scene::Banded;
+use crate::io::scene::{Banded, SceneError};
 use crate::pictures::Studio;
 use crate::progress::Progress;
 use crate::record::{MeasurementRecord, Stop};
@@ -74,7 +75,7 @@ impl Cut {
             let k = finished.record.index;
             let (scene, sensor) = (self.scene.band(k, self.bands.solved(self.bands.middle()))?, finished.sensor()?);
             let view = sensor.as_ref().map(|sensor: &Array3<f32>| sensor.view());
-            factory.pass(&scene, 0, view, finished.record.online.as_ref())?;
+            factory.pass(&scene, 0, view, &finished.record)?;
         }
         if let Some(last) = folder.finished().last() {
             factory.load_weights(&last.weights())?;
@@ -104,9 +105,23 @@ impl Cut {
             }
             // What the bands before have left in pieces would add to what this one takes.
             release_freed_memory();
-            let scene = self.scene.band(k, self.bands.solved(band))?;
+            let scene = match self.scene.band(k, self.bands.solved(band)) {
+                // A shaded border: nothing is measured, and nothing to be found.
+                Err(SceneError::Mask { source: MaskError::AllClosed, .. }) => {
+                    let [frames, channels, _, width] = self.shape();
+                    let video = Array4::zeros((frames, channels, self.bands.kept(band).len(), width));
+                    let record =
+                        MeasurementRecord { index: k, relative_residual: Some(0.0), ..MeasurementRecord::default() };
+                    folder.store_band(record, band, &video, None, |_| Ok(()))?;
+                    continue;
+                }
+                scene => scene?,
+            };
             let learns = learning && band == middle;
             let name = format!("measurement {k:>2}, band {} of {count}", band + 1);
+            if !scene.left_out.is_empty() {
+                eprintln!("warning: {name}: {} pixels left out as not measured", scene.left_out.len());
+            }
             let mut bar = Bar(Progress::of(&name, factory.plan().iterations()));
             let (record, estimate) = solve::band(factory, &scene, k, learns, &mut bar)?;
             bar.0.finish();

@@ -24,6 +24,8 @@ pub(super) struct Ending<'r> {
     pub(super) calibration: Option<Calibration>,
     /// As in the record.
     pub(super) checksums: serde_json::Value,
+    /// As in the record.
+    pub(super) warnings: Vec<String>,
     /// How many measurements were to be solved here.
     pub(super) count: usize,
 }
@@ -48,8 +50,9 @@ impl Ending<'_> {
             folder.keep()?
         };
         results::announce(&record, self.out);
-        if kept > 0 && !complete {
-            outln!("{kept} of {} measurements are solved: add --resume to go on", self.count);
+        if !complete {
+            let how = if kept > 0 { "add --resume to go on" } else { "what is written is of a solve that was stopped" };
+            outln!("{kept} of {} measurements are solved: {how}", self.count);
         }
         results::verdict(&record, self.out)?;
         Ok(if interrupted() && !complete { Done::Interrupted } else { Done::Complete })
@@ -79,6 +82,7 @@ impl Ending<'_> {
         let indices: Vec<usize> = measurements.iter().map(|m| m.index).collect();
         let (files, calibration) = (self.layout.files(&indices), self.calibration.clone());
         let record = solve::record(self.experiment, self.factory, measurements, files, calibration, self.begin)?;
-        Ok(Record { checksums: self.checksums.clone(), ..record })
+        let unsolved = self.count - folder.finished().iter().filter(|f| f.is_whole()).count();
+        Ok(Record { checksums: self.checksums.clone(), warnings: self.warnings.clone(), unsolved, ..record })
     }
 }

@@ -56,7 +56,7 @@ fn pass_solved(scene: &Scene, factory: &mut Factory<'_>, folder: &RunFolder) -> 
     for finished in folder.finished() {
         sensor = finished.sensor()?;
         let view = sensor.as_ref().map(|sensor: &Array3<f32>| sensor.view());
-        factory.pass(scene, finished.record.index, view, finished.record.online.as_ref())?;
+        factory.pass(scene, finished.record.index, view, &finished.record)?;
     }
     if let Some(last) = folder.finished().last() {
         factory.load_weights(&last.weights())?;

@@ -32,11 +32,11 @@ impl Subject {
             Some(cut) => Self::Cut(Box::new(cut)),
             None => Self::Whole(Box::new(Self::whole(experiment)?)),
         };
-        let (warnings, count) = match &subject {
-            Self::Whole(scene) => (&scene.warnings, scene.len()),
-            Self::Cut(cut) => (&cut.scene.warnings, cut.scene.len()),
+        let count = match &subject {
+            Self::Whole(scene) => scene.len(),
+            Self::Cut(cut) => cut.scene.len(),
         };
-        warnings.iter().for_each(|note| say(experiment, note));
+        subject.warnings().iter().for_each(|note| say(experiment, note));
         let chosen = solve::choose(experiment, count).map_err(UsageError)?;
         Ok((subject, chosen))
     }
@@ -76,6 +76,14 @@ impl Subject {
         scene.unpack(beside).context("data.path")?;
         scene.decide(bands.solved(bands.middle()).len()).context("data.path")?;
         Ok(Some(Cut { scene, bands, memory }))
+    }
+
+    /// What looks odd about it.
+    pub(super) fn warnings(&self) -> &[String] {
+        match self {
+            Self::Whole(scene) => &scene.warnings,
+            Self::Cut(cut) => &cut.scene.warnings,
+        }
     }
 
     /// The pattern of a color sensor.

@@ -2,10 +2,12 @@
 
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use nets::train::{Score, StepReport};
+use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
 use plotters::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -147,7 +149,7 @@ impl Log {
             .lines
             .iter()
             .filter_map(|line| match line {
-                Line::Steps { step, loss, .. } if *loss > 0.0 => Some((*step as f64, *loss)),
+                Line::Steps { step, loss, .. } if loss.is_finite() => Some((*step as f64, *loss)),
                 _ => None,
             })
             .collect();
@@ -180,14 +182,13 @@ fn draw(svg: &mut String, losses: &[(f64, f64)], curves: &[Curve]) -> Result<(),
     let (upper, lower) = root.split_vertically(350);
     let steps = losses.iter().chain(curves.iter().flat_map(|(_, c)| c)).map(|p| p.0).fold(1.0, f64::max);
     if let Some((low, high)) = extent(losses.iter().map(|p| p.1)) {
-        let mut chart = ChartBuilder::on(&upper)
-            .caption("training loss", ("sans-serif", 18))
-            .margin(12)
-            .x_label_area_size(30)
-            .y_label_area_size(70)
-            .build_cartesian_2d(0.0..steps, (0.9 * low..1.1 * high).log_scale())?;
-        chart.configure_mesh().x_desc("step").light_line_style(TRANSPARENT).draw()?;
-        chart.draw_series(LineSeries::new(losses.iter().copied(), &BLUE))?;
+        // A logarithm, as PSNR is, may be of either sign.
+        if low > 0.0 {
+            draw_losses(&upper, losses, 0.0..steps, (0.9 * low..1.1 * high).log_scale())?;
+        } else {
+            let margin = (0.05 * (high - low)).max(1e-6);
+            draw_losses(&upper, losses, 0.0..steps, low - margin..high + margin)?;
+        }
     }
     if let Some((low, high)) = extent(curves.iter().flat_map(|(_, c)| c).map(|p| p.1)) {
         let mut chart = ChartBuilder::on(&lower)
@@ -207,6 +208,27 @@ fn draw(svg: &mut String, losses: &[(f64, f64)], curves: &[Curve]) -> Result<(),
         chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK).draw()?;
     }
     root.present()?;
+    Ok(())
+}
+
+fn draw_losses<Y>(
+    area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
+    losses: &[(f64, f64)],
+    x: Range<f64>,
+    y: Y,
+) -> Result<(), DrawError>
+where
+    Y: AsRangedCoord<Value = f64>,
+    Y::CoordDescType: ValueFormatter<f64>,
+{
+    let mut chart = ChartBuilder::on(area)
+        .caption("training loss", ("sans-serif", 18))
+        .margin(12)
+        .x_label_area_size(30)
+        .y_label_area_size(70)
+        .build_cartesian_2d(x, y)?;
+    chart.configure_mesh().x_desc("step").light_line_style(TRANSPARENT).draw()?;
+    chart.draw_series(LineSeries::new(losses.iter().copied(), &BLUE))?;
     Ok(())
 }
 

@@ -4,6 +4,7 @@ mod data;
 mod log;
 mod run;
 
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -53,6 +54,13 @@ impl Args {
         }
         outln!("{}, {} parameters", trainer.describe(), trainer.parameter_count());
         std::fs::create_dir_all(&files.folder).with_context(|| format!("cannot create {}", files.folder.display()))?;
+        let lock = files.folder.join(LOCK);
+        let held = File::create(&lock).with_context(|| format!("cannot write {}", lock.display()))?;
+        if matches!(held.try_lock(), Err(TryLockError::WouldBlock)) {
+            return Err(
+                UsageError(format!("--out {}: another training is at work there", files.folder.display())).into()
+            );
+        }
         if self.resume {
             let resumed = trainer.resume(&files.checkpoint)?;
             if let Some(error) = resumed.refused {
@@ -61,9 +69,16 @@ impl Args {
             outln!("resumed at step {}", trainer.steps_done());
         }
         let log = Log::open(&files.log, trainer.steps_done())?;
-        Run::new(trainer, log, files).finish()
+        let done = Run::new(trainer, log, files).finish();
+        drop(held);
+        // Nobody waits for it: who finds it taken goes away.
+        std::fs::remove_file(&lock).ok();
+        done
     }
 }
+
+/// Held by the training that is at work in a folder.
+const LOCK: &str = ".lock";
 
 /// The files of a run.
 struct Files {

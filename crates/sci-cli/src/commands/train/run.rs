@@ -24,12 +24,14 @@ pub(super) struct Run {
     log: Log,
     files: Files,
     shown: Shown,
+    /// The step of the newest checkpoint, if this run has written it.
+    saved: Option<u64>,
 }
 
 impl Run {
     pub(super) fn new(trainer: Trainer, log: Log, files: Files) -> Self {
         let shown = Shown::new(trainer.config().training.steps, trainer.steps_done());
-        Self { trainer, log, files, shown }
+        Self { trainer, log, files, shown, saved: None }
     }
 
     pub(super) fn finish(mut self) -> anyhow::Result<Done> {
@@ -79,6 +81,7 @@ impl Run {
             return Err(anyhow::Error::new(diverged).context(problem));
         }
         self.trainer.back_off(&self.files.checkpoint).context("after a divergence")?;
+        self.saved = Some(self.trainer.steps_done());
         self.trainer.export(&self.files.weights, Storage::F32)?;
         let (step, rate) = (self.trainer.steps_done(), self.trainer.rate());
         self.log = Log::open(&self.files.log, step)?;
@@ -90,7 +93,12 @@ impl Run {
     fn save(&mut self) -> anyhow::Result<()> {
         // The log first: a checkpoint never lacks the lines before it.
         self.log.flush()?;
-        self.trainer.save(&self.files.checkpoint)?;
+        let step = self.trainer.steps_done();
+        // The same once more would take the place of the checkpoint before.
+        if self.saved != Some(step) {
+            self.trainer.save(&self.files.checkpoint)?;
+            self.saved = Some(step);
+        }
         Ok(self.trainer.export(&self.files.weights, Storage::F32)?)
     }
 }

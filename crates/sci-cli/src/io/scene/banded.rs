@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use ndarray::{Array2, Axis, concatenate};
+use ndarray::{Array2, Axis, concatenate, s};
 use sci_forward::{CfaPattern, VideoShape};
 
 use super::layout::{FileAxes, Place};
@@ -11,13 +11,14 @@ use super::read::{Parts, assembled};
 use super::source::Source;
 use super::{Keys, Reading, Scene, SceneError, Truth, names};
 use crate::io::Format;
+use crate::io::defects::{self, Defects};
 use crate::io::samples::{Array, Samples};
 use crate::io::slab::{self, Stored};
 
 /// A scene of which a band of rows is in memory at a time.
 ///
-/// What white is, where measurements clip and what open is in masks is decided once, by the rows in the middle of the first measurement, and
-/// holds for all bands.
+/// What white is, where measurements clip and what open is in masks is decided once, by rows from all over the first measurement, and holds for all
+/// bands.
 #[derive(Clone, Debug)]
 pub struct Banded {
     file: String,
@@ -34,6 +35,9 @@ pub struct Banded {
     /// What looked odd but is no error.
     pub warnings: Vec<String>,
 }
+
+/// Rows that are looked at together, to decide what numbers mean.
+const BLOCK: usize = 16;
 
 /// An array that plays a part.
 #[derive(Clone, Debug)]
@@ -73,9 +77,18 @@ impl Banded {
         let file = path.display().to_string();
         let Some(slab::Arrays { named, format }) = slab::arrays(path)? else { return Ok(None) };
         let listed: Vec<String> = named.iter().map(|(name, _)| name.clone()).collect();
+        let missing = |key: &str, part| {
+            let near = names::suggestion(key, &listed, &Keys::default());
+            SceneError::MissingKey { file: file.clone(), key: key.into(), part, near, present: listed.clone() }
+        };
+        if let (Some((key, part)), true) =
+            (names::lacking(&reading.keys, &listed, reading.mask.is_some()), format != Format::Npy || path.is_dir())
+        {
+            return Err(missing(key, part));
+        }
         let mut keys = names::resolved(&reading.keys, &listed);
         // The only array of a file without names is the measurements, if masks have a file of their own.
-        if let ([only], Some(_), Format::Npy) = (listed.as_slice(), &reading.mask, format) {
+        if let ([only], Some(_), Format::Npy, false) = (listed.as_slice(), &reading.mask, format, path.is_dir()) {
             keys.meas.clone_from(only);
         }
         // As in a scene that is read whole: a guess that is no video was none.
@@ -83,16 +96,14 @@ impl Banded {
         if keys.orig != reading.keys.orig && !named.iter().any(|array| array.0 == keys.orig && is_video(array)) {
             keys.orig.clone_from(&reading.keys.orig);
         }
-        let part_of = |named: &[(String, Stored)], key: &str, format: Format| {
-            let Some((_, stored)) = named.iter().find(|(name, _)| name == key) else { return Ok(None) };
+        let part_of = |named: &[(String, Stored)], key: &str, format: Format, channels: usize| {
+            let (_, stored) = named.iter().find(|(name, _)| name == key)?;
             let place = Place { file: &file, key, format, axes: reading.axes };
-            let why = || format!("`{key}` has shape {:?}, which is none of the plain ones", stored.shape());
-            let not_plain = || SceneError::NotInBands { file: file.clone(), why: why() };
-            let axes = place.file_axes(stored.shape()).ok_or_else(not_plain)?;
-            Ok::<_, SceneError>(Some(Part { key: key.to_owned(), stored: stored.clone(), axes, format }))
+            let axes = place.file_axes(stored.shape(), channels).filter(|_| stored.in_parts());
+            Some(axes.map(|axes| Part { key: key.to_owned(), stored: stored.clone(), axes, format }))
         };
         let mask = match &reading.mask {
-            None => part_of(&named, &keys.mask, format)?,
+            None => part_of(&named, &keys.mask, format, 1),
             Some(path) => {
                 let Some(own) = slab::arrays(path)? else { return Ok(None) };
                 // What orders its axes in another way is put in order by reading it whole.
@@ -102,18 +113,19 @@ impl Banded {
                 let listed: Vec<String> = own.named.iter().map(|(name, _)| name.clone()).collect();
                 let found = names::resolved(&Keys { mask: reading.keys.mask.clone(), ..Keys::default() }, &listed);
                 let key = if own.named.len() == 1 { listed[0].clone() } else { found.mask };
-                part_of(&own.named, &key, own.format)?
+                part_of(&own.named, &key, own.format, 1)
             }
         };
-        let missing = |key: &str, part| {
-            let near = names::suggestion(key, &listed, &Keys::default());
-            SceneError::MissingKey { file: file.clone(), key: key.into(), part, near, present: listed.clone() }
-        };
         let mask = mask.ok_or_else(|| missing(&keys.mask, "the masks; data.mask names a file of their own"))?;
-        let meas = part_of(&named, &keys.meas, format)?;
-        let rgb = part_of(&named, &keys.rgb, format)?;
+        let meas = part_of(&named, &keys.meas, format, 1);
+        let rgb = part_of(&named, &keys.rgb, format, 3);
         let is_color = rgb.is_some() || reading.cfa.is_some();
-        let truth = if rgb.is_some() { rgb } else { part_of(&named, &keys.orig, format)? };
+        let truth = if rgb.is_some() { rgb } else { part_of(&named, &keys.orig, format, 1) };
+        // What is stored in another way than the plain ones is read whole.
+        let (Some(mask), false, false) = (mask, matches!(meas, Some(None)), matches!(truth, Some(None))) else {
+            return Ok(None);
+        };
+        let (meas, truth) = (meas.flatten(), truth.flatten());
         let frames = mask.frames();
         if frames == 0 || mask.size().0 == 0 || mask.size().1 == 0 {
             let why = format!("`{}` has shape {:?}: nothing is in it", mask.key, mask.stored.shape());
@@ -151,14 +163,20 @@ impl Banded {
         parts.into_iter().flatten().try_for_each(|part| Ok(part.stored.unpack(folder)?))
     }
 
-    /// Decides by `rows` rows in the middle of the first measurement what the numbers mean.
+    /// Decides by `rows` rows of the first measurement what the numbers mean: the sky at the top of a scene is brighter than its middle, so that they
+    /// are from all over it.
     ///
     /// # Errors
     /// Those of reading them, and if they tell a white that does not go with the truth.
     pub fn decide(&mut self, rows: usize) -> Result<(), SceneError> {
-        let (height, rows) = (self.shape.height, rows.max(2).min(self.shape.height));
-        let first = (height - rows) / 2 / 2 * 2;
-        let part = self.band(0, first..first + rows)?;
+        let (height, blocks) = (self.shape.height, (rows / BLOCK).max(1));
+        // At even rows, where a Bayer pattern begins.
+        let apart = (height / blocks / 2 * 2).max(BLOCK);
+        let spread: Vec<Range<usize>> =
+            (0..height).step_by(apart).map(|first| first..(first + BLOCK).min(height)).collect();
+        let mut part = self.part(&[0], &spread)?;
+        // Pixels of two blocks are no neighbours, and have other rows here.
+        part.warnings.retain(|note| !defects::is_note(note));
         if part.unit != 1.0 && self.truth.is_some() {
             let why = "neither measurements nor truth are on a usual scale; say in data.scale what white is".into();
             return Err(SceneError::NotInBands { file: self.file.clone(), why });
@@ -199,11 +217,33 @@ impl Banded {
     /// # Panics
     /// If there is no such measurement, or there are no such rows.
     pub fn band(&self, k: usize, rows: Range<usize>) -> Result<Scene, SceneError> {
-        let source = Source::part(self.file.clone(), self.mask.format);
-        let mask = Some(self.mask.read(0..self.shape.frames, rows.clone())?);
-        let meas = self.meas.as_ref().map(|part| part.read(k..k + 1, rows.clone())).transpose()?;
-        let truth = self.frames_of(k).map(|(part, frames)| part.read(frames, rows)).transpose()?;
+        // Hot pixels are told from highlights by another measurement.
+        let other = (k + 1) % self.count;
+        let looks = self.reading.defects == Defects::Exclude && self.meas.is_some() && other != k;
+        let both = if looks { vec![k, other] } else { vec![k] };
+        let mut scene = self.part(&both, &[rows])?;
+        scene.measurements = scene.measurements.slice_move(s![..1, .., ..]);
+        Ok(scene)
+    }
+
+    /// The scene that these rows of measurements are, with the truth of the first of them.
+    fn part(&self, chosen: &[usize], rows: &[Range<usize>]) -> Result<Scene, SceneError> {
+        let read = |part: &Part, frames: Range<usize>| -> Result<Array, SceneError> {
+            let blocks = rows.iter().map(|rows| part.read(frames.clone(), rows.clone()));
+            Ok(Array::joined(&blocks.collect::<Result<Vec<_>, _>>()?, part.axes.row))
+        };
+        let mask = Some(read(&self.mask, 0..self.shape.frames)?);
+        let meas = |part: &Part| match (part.axes.frame, chosen) {
+            (Some(axis), [_, _, ..]) => {
+                let all = chosen.iter().map(|&k| read(part, k..k + 1)).collect::<Result<Vec<_>, _>>()?;
+                Ok::<_, SceneError>(Array::joined(&all, axis))
+            }
+            _ => read(part, chosen[0]..chosen[0] + 1),
+        };
+        let meas = self.meas.as_ref().map(meas).transpose()?;
+        let truth = self.frames_of(chosen[0]).map(|(part, frames)| read(part, frames)).transpose()?;
         let (rgb, orig) = if self.has_rgb() { (truth, None) } else { (None, truth) };
+        let source = Source::part(self.file.clone(), self.mask.format);
         let keys = self.reading.keys.clone();
         assembled(&source, Parts { keys, names: Vec::new(), mask, meas, orig, rgb, notes: Vec::new() }, &self.reading)
     }
@@ -351,5 +391,75 @@ mod tests {
             let error = Banded::open(&path, &Reading::default()).unwrap_err().to_string();
             assert!(error.contains(said) && error.contains("scene.npz"), "{error}");
         }
+    }
+
+    /// Sky at the top is bright, which the rows in the middle do not show.
+    #[test]
+    fn what_numbers_mean_is_decided_by_rows_from_all_over() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
+        npz.add_array("mask", &Array3::from_shape_fn((4, 320, 6), |(t, y, x)| ((t + y + x) % 2) as u8)).unwrap();
+        let light = |y: usize| if y < 60 { 3000 } else { 200 };
+        npz.add_array("meas", &Array3::from_shape_fn((1, 320, 6), |(_, y, x)| (light(y) + x) as u16)).unwrap();
+        npz.finish().unwrap();
+        let whole = super::super::read(&path, &Reading::default()).unwrap();
+        let mut banded = Banded::open(&path, &Reading::default()).unwrap().unwrap();
+        banded.decide(64).unwrap();
+        let band = banded.band(0, 200..232).unwrap();
+        let (part, all) = (band.y(0), whole.y(0));
+        assert!(part.iter().zip(all.slice(s![200..232, ..])).all(|(a, b)| (a - b).abs() <= 0.1 * b), "{part} {all}");
+    }
+
+    #[test]
+    fn hot_pixels_are_told_by_another_measurement() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
+        npz.add_array("mask", &Array3::from_shape_fn((4, 48, 16), |(t, y, x)| ((t + y + x) % 2) as f32)).unwrap();
+        let hot = |y: usize, x: usize| if (y, x) == (21, 7) { 2.0 } else { 0.6 };
+        npz.add_array("meas", &Array3::from_shape_fn((2, 48, 16), |(_, y, x)| hot(y, x))).unwrap();
+        npz.finish().unwrap();
+        let reading = Reading { defects: Defects::Exclude, scale: Some(1.0), ..Reading::default() };
+        let mut banded = Banded::open(&path, &reading).unwrap().unwrap();
+        banded.decide(32).unwrap();
+        for k in 0..2 {
+            let band = banded.band(k, 16..32).unwrap();
+            assert_eq!((band.len(), band.left_out.len(), band.operator.gram()[[5, 7]]), (1, 1, 0.0));
+        }
+    }
+
+    #[test]
+    fn a_packed_member_is_checked_to_its_end() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new_compressed(std::fs::File::create(&path).unwrap());
+        let mut state = 1u32;
+        let noise = Array3::from_shape_simple_fn((2, 64, 64), || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as u8
+        });
+        npz.add_array("mask", &noise).unwrap();
+        npz.add_array("meas", &Array3::<u8>::ones((1, 64, 64))).unwrap();
+        npz.finish().unwrap();
+        let mut bytes = std::fs::read(&path).unwrap();
+        let unpacked = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            Banded::open(&path, &Reading::default()).unwrap().unwrap().unpack(dir.path()).map_err(|e| e.to_string())
+        };
+        assert_eq!(unpacked(&bytes), Ok(()));
+        bytes[3000] ^= 4;
+        assert!(unpacked(&bytes).is_err());
+    }
+
+    #[test]
+    fn shapes_that_are_not_plain_and_folders_are_read_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
+        npz.add_array("mask", &ndarray::Array4::<u8>::ones((1, 3, 8, 8))).unwrap();
+        npz.add_array("meas", &Array3::<u8>::ones((1, 8, 8))).unwrap();
+        npz.finish().unwrap();
+        assert!(Banded::open(&path, &Reading::default()).unwrap().is_none());
     }
 }

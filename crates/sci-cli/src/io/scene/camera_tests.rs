@@ -225,7 +225,8 @@ fn twelve_bits_in_sixteen_are_said() {
     let reading = Reading { mask: Some(dir.npy("mask.npy", &mask())), ..Reading::default() };
     let scene = super::read(&dir.tiff16("meas.tif", &meas()), &reading).unwrap();
     assert!(scene.warnings[0].contains("white is taken to be 4095"), "{:?}", scene.warnings);
-    let worst = (&scene.measurements - &(meas() / 4095.0)).fold(0f32, |worst, d| worst.max(d.abs()));
+    assert!(scene.warnings[1].contains("darker or brighter than scenes are"), "{:?}", scene.warnings);
+    let worst = (&scene.measurements * scene.unit - &(meas() / 4095.0)).fold(0f32, |worst, d| worst.max(d.abs()));
     assert!(worst < 1e-6, "{worst}");
     let video =
         read_video(&dir.tiff16("video.tif", &(meas() + Array3::<f32>::zeros((5, 6, 8)))), &Reading::default()).unwrap();
@@ -260,4 +261,95 @@ fn mistakes_are_called_by_their_name() {
     let keys = Keys { mask: "maks".into(), ..Keys::default() };
     let text = error(&turned, &Reading { keys, ..Reading::default() });
     assert!(text.contains("`maks`") && text.contains("did you mean `mask`"), "{text}");
+}
+
+/// To go on with what is there instead would be to solve something else.
+#[test]
+fn a_key_that_is_given_and_not_there_is_refused() {
+    let dir = Folder::new();
+    let mut zip = Cursor::new(Vec::new());
+    let (mask, meas) = (mask().into_dyn(), meas().into_dyn());
+    npy::write_npz(&mut zip, &[("mask", mask.view()), ("meas", meas.view()), ("orig", mask.view())]).unwrap();
+    let path = dir.write("scene.npz", zip.into_inner());
+    for keys in [Keys { meas: "maes".into(), ..Keys::default() }, Keys { orig: "gruond".into(), ..Keys::default() }] {
+        let wrong = if keys.meas == "maes" {
+            "`maes` (the measurements) (did you mean `meas`?)"
+        } else {
+            "`gruond` (the truth)"
+        };
+        let reading = Reading { keys, ..scaled(1000.0) };
+        let whole = super::read(&path, &reading).unwrap_err().to_string();
+        let banded = Banded::open(&path, &reading).unwrap_err().to_string();
+        assert!(whole.contains(wrong) && banded.contains(wrong), "{whole} {banded}");
+    }
+}
+
+fn of(mask: Array3<f32>, meas: Array3<f32>, reading: &Reading) -> Scene {
+    let array = |array: Array3<f32>| {
+        let shape = array.shape().to_vec();
+        crate::io::samples::Array::new(
+            shape,
+            crate::io::samples::Samples::Floats(array.into_raw_vec_and_offset().0),
+            crate::io::samples::SampleType::F32,
+        )
+        .unwrap()
+    };
+    of_arrays(Arrays { mask: array(mask), meas: Some(array(meas)), truth: None }, reading).unwrap()
+}
+
+/// Masks through which everything is seen, and a scene of this brightness.
+fn bright(level: f32) -> (Array3<f32>, Array3<f32>) {
+    let mask = MaskStack::random(sci_forward::VideoShape { frames: 4, height: 48, width: 48 }, 0.6, 1).unwrap();
+    let mask = mask.view().to_owned();
+    let frames = Array3::from_shape_fn(mask.dim(), |(t, y, x)| level * (0.6 + 0.4 * ((t + y + x) as f32 * 0.3).sin()));
+    let meas = (&mask * &frames).sum_axis(Axis(0)).insert_axis(Axis(0));
+    (mask, meas)
+}
+
+#[test]
+fn captures_that_are_dark_are_brought_to_white_unless_noise_is_told_in_it() {
+    let (mask, meas) = bright(0.1);
+    let scene = of(mask.clone(), meas.clone(), &Reading::default());
+    assert!((0.05..0.15).contains(&scene.unit), "{}", scene.unit);
+    assert!(scene.warnings[0].contains("darker or brighter than scenes are"), "{:?}", scene.warnings);
+    let mut reading = Reading::default();
+    reading.sensor.noise = SensorNoise::Known(Noise::new(None, 0.01).unwrap());
+    let scene = of(mask, meas, &reading);
+    assert!(scene.unit == 1.0 && scene.warnings[0].contains("data.scale = 0."), "{:?}", scene.warnings);
+    let (mask, meas) = bright(0.8);
+    let scene = of(mask, meas, &Reading::default());
+    assert!(scene.unit == 1.0 && scene.warnings.is_empty(), "{:?}", scene.warnings);
+}
+
+#[test]
+fn what_a_dark_frame_leaves_of_a_shaded_border_measures_nothing() {
+    let (mut mask, mut meas) = bright(0.8);
+    mask.slice_mut(s![.., ..3, ..]).fill(4e-4);
+    meas.slice_mut(s![.., ..3, ..]).fill(0.02);
+    let scene = of(mask, meas, &Reading::default());
+    assert!(scene.unit == 1.0 && scene.operator.gram().slice(s![..3, ..]).iter().all(|&g| g == 0.0));
+    assert!(scene.warnings.iter().any(|note| note.starts_with("144 pixels that masks open")), "{:?}", scene.warnings);
+}
+
+#[test]
+fn masks_that_are_turned_are_told() {
+    let (mask, meas) = bright(0.8);
+    let turned = mask.slice(s![.., ..;-1, ..]).as_standard_layout().into_owned();
+    let scene = of(turned, meas, &Reading::default());
+    assert!(scene.warnings.iter().any(|note| note.contains("mirrored top to bottom")), "{:?}", scene.warnings);
+}
+
+/// Labels are masks too.
+#[test]
+fn pictures_of_zeros_and_ones_are_open_where_they_are_one() {
+    let dir = Folder::new();
+    is_the_scene(&two(&dir.npy("meas.npy", &meas()), &dir.tiff16("mask.tif", &mask())));
+}
+
+#[test]
+fn a_level_that_nothing_reaches_is_noticed() {
+    let (mask, meas) = bright(0.8);
+    let mut reading = Reading { scale: Some(1.0), ..Reading::default() };
+    reading.sensor.clip = Clip::Level(1000.0);
+    assert!(of(mask, meas, &reading).warnings[0].contains("data.sensor.clip = 1000"));
 }

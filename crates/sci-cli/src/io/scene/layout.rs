@@ -36,8 +36,8 @@ impl Place<'_> {
         if self.is_picture() { usual } else { self.axes.unwrap_or(usual) }
     }
 
-    /// Which axes of an array in its file are which; nothing if its shape is not one of the plain ones.
-    pub(super) fn file_axes(&self, shape: &[usize]) -> Option<FileAxes> {
+    /// Which axes of an array in its file are which, one of `channels` among four; nothing if its shape is not one of the plain ones.
+    pub(super) fn file_axes(&self, shape: &[usize], channels: usize) -> Option<FileAxes> {
         let reversed = self.format == Format::Mat;
         let mut meant = shape.to_vec();
         if reversed {
@@ -47,9 +47,9 @@ impl Place<'_> {
             (_, [_, _]) => (None, 0, 1),
             (Axes::Thw, [_, _, _]) => (Some(0), 1, 2),
             (Axes::Hwt, [_, _, _]) => (Some(2), 0, 1),
-            (Axes::Hwt, [_, _, 1 | 3, _]) => (Some(3), 0, 1),
-            (Axes::Thw, [_, 1 | 3, _, _]) => (Some(0), 2, 3),
-            (Axes::Thw, [_, _, _, 1 | 3]) => (Some(0), 1, 2),
+            (Axes::Hwt, [_, _, c, _]) if *c == channels => (Some(3), 0, 1),
+            (Axes::Thw, [_, c, _, _]) if *c == channels => (Some(0), 2, 3),
+            (Axes::Thw, [_, _, _, c]) if *c == channels => (Some(0), 1, 2),
             _ => return None,
         };
         let in_file = |axis: usize| if reversed { shape.len() - 1 - axis } else { axis };

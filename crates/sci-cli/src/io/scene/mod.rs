@@ -21,6 +21,7 @@ mod error;
 pub(crate) mod field;
 mod layout;
 mod names;
+mod orientation;
 mod read;
 mod scale;
 mod sensor;
@@ -169,11 +170,7 @@ impl Scene {
         truth: Option<Truth>,
         cfa: Option<CfaPattern>,
     ) -> Result<Self, SceneError> {
-        let masks = MaskStack::new(mask).map_err(|source| SceneError::Mask {
-            file: file.into(),
-            key: keys.mask.clone(),
-            source,
-        })?;
+        let masks = read::checked(mask, file, &keys.mask)?;
         let (height, width) = masks.shape().image_dim();
         let check = |key: &str, array: ArrayView3<'_, f32>| {
             check_size(file, key, array, &keys.mask, (height, width))?;
@@ -226,6 +223,11 @@ impl Scene {
         };
         scene.look_for_wrong_scales(brightest);
         Ok(scene)
+    }
+
+    /// What white is in the numbers of the file that measurements came in.
+    pub fn white(&self) -> f32 {
+        self.decided.meas * self.unit
     }
 
     /// B, frames a measurement sums.
@@ -316,8 +318,9 @@ impl Scene {
         });
         if let Some(mismatch) = mismatch.filter(|&m| m > 0.2) {
             self.warnings.push(format!(
-                "measurement 0 differs by {:.0} % from the masked sum of the truth; do mask, measurement and truth belong together?",
-                100.0 * mismatch
+                "measurement 0 differs by {:.0} % from the masked sum of the truth; do mask, measurement and truth belong together{}?",
+                100.0 * mismatch,
+                if self.rgb.is_some() { ", and is data.cfa the sensor's" } else { "" }
             ));
         }
     }
@@ -388,14 +391,23 @@ const PLAUSIBLE_WHITE: std::ops::RangeInclusive<f32> = 1.0 / 64.0..=4.0;
 
 /// What is white in measurements `[N, H, W]` of masks `[B, H, W]` if their brightest hundredth is; nothing if there is no light.
 fn brightest_light(meas: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>) -> Option<f32> {
-    let open = masks.sum_axis(Axis(0));
-    // Masks of both signs may add up to nothing at a pixel.
-    let light = |y: ArrayView2<'_, f32>| match is_signed(masks) {
+    let mut open = masks.sum_axis(Axis(0));
+    let is_signed = is_signed(masks);
+    if !is_signed {
+        // What is divided by little light is noise.
+        let least = HARDLY_OPEN * field::median(&open);
+        open.mapv_inplace(|open| if open < least { 0.0 } else { open });
+    }
+    // Masks of both signs may add up to nothing at a pixel. Those that are closed come out infinite, and do not count.
+    let light = |y: ArrayView2<'_, f32>| match is_signed {
         true => brightness(y, open.view(), EVEN),
         false => &y / &open,
     };
     brightest_hundredth(meas.outer_iter().flat_map(light)).filter(|&bright| bright > 0.0)
 }
+
+/// Pixels that masks open for less than this share of the usual tell nothing that is to be divided by it.
+pub(crate) const HARDLY_OPEN: f32 = 0.2;
 
 /// The defective pixels of measurements `[N, H, W]` of masks `[B, H, W]` that may sit `off` pixels elsewhere.
 fn defects_of(masks: ArrayView3<'_, f32>, meas: ArrayView3<'_, f32>, is_color: bool, off: usize) -> Vec<Defect> {
@@ -488,7 +500,7 @@ mod tests {
         let path = write_scene(dir.path(), Some(column_major((2, 3, 4), |_, _, _| 1e8 * 255.0)));
         let scene = read(&path, &Reading::default()).unwrap();
         assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1e8, 1.0));
-        assert!(scene.warnings[0].contains("white is taken to be 1e8"), "{:?}", scene.warnings);
+        assert!(scene.warnings[0].contains("white is taken to be 2.55e10"), "{:?}", scene.warnings);
         let scene = read(&path, &Reading { scale: Some(255.0), ..Reading::default() }).unwrap();
         assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1.0, 1e8));
     }

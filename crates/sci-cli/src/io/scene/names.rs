@@ -43,6 +43,19 @@ pub(super) fn resolved(keys: &Keys, names: &[String]) -> Keys {
     }
 }
 
+/// A name that the experiment gives to a part and a file lacks, and the part: to go on with another would be to solve something else.
+pub(super) fn lacking<'k>(keys: &'k Keys, names: &[String], masks_elsewhere: bool) -> Option<(&'k str, &'static str)> {
+    let own = Keys::default();
+    let parts = [
+        (&keys.mask, own.mask, "the masks"),
+        (&keys.meas, own.meas, "the measurements"),
+        (&keys.orig, own.orig, "the truth"),
+        (&keys.rgb, own.rgb, "the truth in color"),
+    ];
+    let mut given = parts.into_iter().skip(usize::from(masks_elsewhere)).filter(|(key, own, _)| *key != own);
+    given.find(|(key, ..)| !names.contains(key)).map(|(key, _, part)| (key.as_str(), part))
+}
+
 /// What is to be said about names that were found in the place of others.
 pub(super) fn notes(keys: &Keys, found: &Keys) -> Vec<String> {
     let parts = [
@@ -67,8 +80,9 @@ pub(super) fn suggestion(key: &str, present: &[String], own: &Keys) -> Option<St
         .into_iter()
         .find(|(own, others)| own.as_str() == lower || others.contains(&lower.as_str()))
         .map_or((key, &[][..]), |(own, others)| (own.as_str(), others));
-    let close = |name: &&String| strsim::damerau_levenshtein(&name.to_ascii_lowercase(), &lower) <= 2;
-    name_of(own, own, others, present).or_else(|| present.iter().find(close).cloned())
+    let distance = |name: &&String| strsim::damerau_levenshtein(&name.to_ascii_lowercase(), &lower);
+    let close = || present.iter().min_by_key(distance).filter(|name| distance(name) <= 2);
+    name_of(own, own, others, present).or_else(|| close().cloned())
 }
 
 #[cfg(test)]
@@ -102,6 +116,8 @@ mod tests {
         let given = Keys { mask: "maks".into(), ..Keys::default() };
         let there = names(&["mask", "a.mask", "b.mask"]);
         assert_eq!(resolved(&given, &there).mask, "maks");
+        assert_eq!(lacking(&given, &there, false), Some(("maks", "the masks")));
+        assert_eq!((lacking(&given, &there, true), lacking(&Keys::default(), &there, false)), (None, None));
         assert_eq!(suggestion("maks", &there, &Keys::default()).as_deref(), Some("mask"));
         assert_eq!(suggestion("mask", &names(&["a", "Phi"]), &Keys::default()).as_deref(), Some("Phi"));
         assert_eq!(suggestion("mask", &names(&["depth"]), &Keys::default()), None);

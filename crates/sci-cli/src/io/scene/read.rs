@@ -6,16 +6,16 @@ use ndarray::{Array3, Array4, ArrayView3, Axis};
 use sci_forward::bayer::mosaic_into;
 use sci_forward::{MaskStack, Noise};
 
-use super::field::Field;
+use super::field::{Field, median};
 use super::layout::Place;
 use super::scale::{self, Content};
 use super::source::Source;
 use super::{
     Defects, Keys, PLAUSIBLE_WHITE, Reading, Scene, SceneError, Sensor, SensorNoise, Truth, brightest_hundredth,
-    brightest_light, check_size, defects_of, is_signed, light_through, names, operator_of,
+    brightest_light, check_size, defects_of, is_signed, light_through, names, operator_of, orientation,
 };
 use crate::io::defects::LeftOut;
-use crate::io::samples::Array;
+use crate::io::samples::{Array, Samples};
 use crate::io::{NamedArrays, defects};
 
 /// The arrays of a scene as they are stored.
@@ -42,11 +42,13 @@ pub struct Decided {
     pub(super) clip: Option<f32>,
     /// [`Scene::unit`].
     pub(super) unit: f32,
+    /// Pixels whose masks add up to less than this measure nothing.
+    pub(super) least_open: f32,
 }
 
 impl Default for Decided {
     fn default() -> Self {
-        Self { open: 1.0, truth: 1.0, meas: 1.0, clip: None, unit: 1.0 }
+        Self { least_open: 0.0, open: 1.0, truth: 1.0, meas: 1.0, clip: None, unit: 1.0 }
     }
 }
 
@@ -60,7 +62,14 @@ impl Parts {
             let (keys, names, notes) = (reading.keys.clone(), Vec::new(), Vec::new());
             return Ok(Self { keys, names, notes, mask: None, meas: Some(source.single()?), orig: None, rgb: None });
         }
-        let mut keys = names::resolved(&reading.keys, &source.names()?);
+        let present = source.names()?;
+        // What is in memory has no names.
+        if !present.is_empty()
+            && let Some((key, part)) = names::lacking(&reading.keys, &present, reading.mask.is_some())
+        {
+            return Err(source.missing(key, part, present));
+        }
+        let mut keys = names::resolved(&reading.keys, &present);
         if reading.mask.is_some() {
             keys.mask.clone_from(&reading.keys.mask);
         }
@@ -139,6 +148,7 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
     } else if mask.len_of(Axis(0)) == 1 {
         notes.push("there is one mask, so that a measurement is one frame (B = 1); if it moves, data.mask_shift and data.frames say how".into());
     }
+    close_hardly_open(&mut mask, reading.decided.is_some(), &mut decided, &mut notes);
     let (mut black, mut left_out) = (0.0, Vec::new());
     if let (Some(meas), Some(array)) = (meas.as_mut(), &stored) {
         if reading.decided.is_none() {
@@ -155,12 +165,18 @@ pub(super) fn assembled(source: &Source, mut parts: Parts, reading: &Reading) ->
         if meas.shape()[1..] == mask.shape()[1..] {
             match reading.decided {
                 None if reading.scale.is_none() => {
-                    decided.unit = rescale((&mask, in_own_unit), meas, truth.as_mut(), &mut notes);
+                    let has_unit = matches!(reading.sensor.noise, SensorNoise::Known(_));
+                    let white = decided.meas;
+                    decided.unit = rescale((&mask, in_own_unit), meas, truth.as_mut(), (has_unit, white), &mut notes);
                 }
                 _ => *meas /= decided.unit,
             }
             left_out = look_for_defects(&mut mask, meas, reading, is_color, &mut notes);
         }
+    }
+    if let (Some(meas), None) = (meas.as_ref().filter(|meas| meas.shape()[1..] == mask.shape()[1..]), reading.decided) {
+        let (open, lattice) = (light_through(mask.view()), if is_color { 2 } else { 1 });
+        notes.extend(orientation::doubt(open.view(), meas.index_axis(Axis(0), 0), lattice));
     }
     let noise = noise_of(&reading.sensor, mask.view(), meas.as_ref(), &mut notes);
     let mut scene = Scene::new(&source.file, &parts.keys, mask, meas, truth, reading.cfa)?;
@@ -187,10 +203,7 @@ pub fn as_read(scene: &mut Scene, masks: MaskStack, reading: &Reading) -> Result
     scene.left_out =
         look_for_defects(&mut mask, &mut scene.measurements, reading, scene.cfa.is_some(), &mut scene.warnings);
     if reading.defects == Defects::Exclude {
-        let key = reading.keys.mask.clone();
-        let masks =
-            MaskStack::new(mask).map_err(|source| SceneError::Mask { file: "simulated".into(), key, source })?;
-        scene.operator = operator_of(masks);
+        scene.operator = operator_of(checked(mask, "simulated", &reading.keys.mask)?);
     }
     Ok(())
 }
@@ -205,7 +218,10 @@ fn scene_masks(
     notes: &mut Vec<String>,
 ) -> Result<(Array3<f32>, bool), SceneError> {
     if let Some(path) = &reading.mask {
-        return masks_of(&Source::open(path, None)?, reading, field, decided, notes);
+        let source = Source::open(path, None)?;
+        let (masks, key, in_own_unit) = masks_of(&source, reading, field, decided, notes)?;
+        // Here, where the file has its name.
+        return Ok((checked(masks, &source.file, &key)?.view().to_owned(), in_own_unit));
     }
     let key = &parts.keys.mask;
     let Some(array) = parts.mask.take() else {
@@ -216,14 +232,14 @@ fn scene_masks(
     transmittances(&place, &array, reading, field, decided, notes)
 }
 
-/// The masks that a file holds, under their name if it has names.
+/// The masks that a file holds, under their name if it has names, that name, and whether they were in a unit of their own.
 fn masks_of(
     source: &Source,
     reading: &Reading,
     field: &Field,
     decided: &mut Decided,
     notes: &mut Vec<String>,
-) -> Result<(Array3<f32>, bool), SceneError> {
+) -> Result<(Array3<f32>, String, bool), SceneError> {
     let mut wanted = reading.keys.mask.clone();
     if source.is_named() {
         let own = Keys { mask: reading.keys.mask.clone(), ..Keys::default() };
@@ -233,12 +249,11 @@ fn masks_of(
     let (array, key) = source.array(&wanted, "the masks")?;
     let place = Place { file: &source.file, key: &key, format: source.format(), axes: reading.axes };
     let (masks, in_own_unit) = transmittances(&place, &array, reading, field, decided, notes)?;
-    let checked = MaskStack::new(masks).map_err(|source_error| SceneError::Mask {
-        file: source.file.clone(),
-        key: key.clone(),
-        source: source_error,
-    })?;
-    Ok((checked.view().to_owned(), in_own_unit))
+    Ok((masks, key, in_own_unit))
+}
+
+pub(super) fn checked(masks: Array3<f32>, file: &str, key: &str) -> Result<MaskStack, SceneError> {
+    MaskStack::new(masks).map_err(|source| SceneError::Mask { file: file.into(), key: key.into(), source })
 }
 
 /// Masks as transmittances, and whether they were in a unit of their own.
@@ -251,6 +266,7 @@ fn transmittances(
     notes: &mut Vec<String>,
 ) -> Result<(Array3<f32>, bool), SceneError> {
     let full = match place.is_picture() && array.stored().is_integer() && field.white.is_none() {
+        true if is_zero_and_one(array) => 1.0,
         true => {
             let white = scale::of_video(place.key, &Content::of(array, place.format));
             notes.extend(white.note);
@@ -260,6 +276,14 @@ fn transmittances(
     };
     let masks = field.transmittances(place.frames(array, 1.0)?, full, (place.key, reading), notes)?;
     Ok(normalised(masks, place.key, reading.decided.is_some(), decided, notes))
+}
+
+/// Whether an array has nothing but 0 and 1: labels, as masks are saved in pictures too.
+fn is_zero_and_one(array: &Array) -> bool {
+    match array.samples() {
+        Samples::Bytes(v) => v.iter().all(|&v| v <= 1),
+        Samples::Floats(v) => v.iter().all(|&v| v == 0.0 || v == 1.0),
+    }
 }
 
 /// Masks as transmittances, and whether they were in a unit of their own. Those saved as black and white run to full scale; others that
@@ -295,6 +319,27 @@ fn normalised(
     (mask, !is_black_and_white)
 }
 
+/// Closes pixels that masks open for next to nothing, as what a dark frame leaves of a shaded border: what they measure is noise, which would be
+/// divided by as little.
+fn close_hardly_open(mask: &mut Array3<f32>, is_decided: bool, decided: &mut Decided, notes: &mut Vec<String>) {
+    if is_signed(mask.view()) {
+        return;
+    }
+    let open = mask.sum_axis(Axis(0));
+    if !is_decided {
+        decided.least_open = NOT_OPEN * median(&open);
+    }
+    let hardly = open.mapv(|open| open > 0.0 && open < decided.least_open);
+    let count = hardly.iter().filter(|&&hardly| hardly).count();
+    if count > 0 {
+        mask.outer_iter_mut()
+            .for_each(|mut mask| mask.zip_mut_with(&hardly, |c, &hardly| *c *= f32::from(u8::from(!hardly))));
+        notes.push(format!("{count} pixels that masks open for less than 1 % of the usual count as not measured"));
+    }
+}
+
+/// The share of the usual light that is none.
+const NOT_OPEN: f32 = 0.01;
 /// Negative transmittances are noise down to this share of the largest.
 const SMALL: f32 = 0.1;
 /// Gains of single frames may take a transmittance above 1.
@@ -476,17 +521,29 @@ fn look_for_defects(
 }
 
 /// Brings measurements that are far off their scale, or have none as their masks were in a unit of their own, and truth that is too, to
-/// one on which the brightest hundredth is white; returns what white was.
+/// one on which the brightest hundredth is white; returns what white was. Without a truth, dark and bright ones are brought there too, as a camera's
+/// numbers end with the light of all frames, of which one has a part, and networks know scenes of usual brightness best; but not where noise is told
+/// in units of white (`has_unit`), which in the file is `full`.
 fn rescale(
     (mask, in_own_unit): (&Array3<f32>, bool),
     meas: &mut Array3<f32>,
     truth: Option<&mut Truth>,
+    (has_unit, full): (bool, f32),
     warnings: &mut Vec<String>,
 ) -> f32 {
     let Some(white) = brightest_light(meas.view(), mask.view()) else { return 1.0 };
     let unknown = in_own_unit && truth.is_none();
+    let unusual = truth.is_none() && !scale::BELIEVABLE.contains(&white);
     if PLAUSIBLE_WHITE.contains(&white) && !unknown {
-        return 1.0;
+        if unusual && has_unit {
+            warnings.push(format!(
+                "the brightest hundredth is {white:.2} of white, which is taken to be {full}; data.scale = {:.4} would make it white",
+                white * full
+            ));
+        }
+        if !unusual || has_unit {
+            return 1.0;
+        }
     }
     *meas /= white;
     let values = match truth {
@@ -498,9 +555,14 @@ fn rescale(
     if let Some(mut x) = values.filter(|x| brightest_hundredth(x.iter().copied()).is_some_and(is_off)) {
         x /= white;
     }
-    let why = if unknown { "masks are in a unit of their own" } else { "measurements are off their scale" };
+    let why = match () {
+        () if unknown => "masks are in a unit of their own",
+        () if PLAUSIBLE_WHITE.contains(&white) => "measurements are darker or brighter than scenes are",
+        () => "measurements are off their scale",
+    };
     warnings.push(format!(
-        "{why}: white is taken to be {white:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another"
+        "{why}: white is taken to be {:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another",
+        white * full
     ));
     white
 }
@@ -534,6 +596,10 @@ pub fn read_video(path: &Path, reading: &Reading) -> Result<Video, SceneError> {
     let mut notes = Vec::new();
     let (array, key) = if source.is_named() {
         let names = source.names()?;
+        let Keys { orig, rgb, .. } = reading.keys.clone();
+        if let Some((key, part)) = names::lacking(&Keys { orig, rgb, ..Keys::default() }, &names, false) {
+            return Err(source.missing(key, part, names));
+        }
         let keys = names::resolved(&reading.keys, &names);
         let key = if names.contains(&keys.orig) { keys.orig.clone() } else { keys.rgb.clone() };
         let array = source.arrays(&[key.as_str()])?.arrays.remove(&key);
@@ -573,11 +639,6 @@ fn luma(video: Array4<f32>) -> Array4<f32> {
 pub fn read_mask(path: &Path, reading: &Reading) -> Result<(MaskStack, Vec<String>), SceneError> {
     let source = Source::open(path, None)?;
     let mut notes = Vec::new();
-    let (masks, _) = masks_of(&source, reading, &Field::default(), &mut Decided::default(), &mut notes)?;
-    let masks = MaskStack::new(masks).map_err(|e| SceneError::Mask {
-        file: source.file,
-        key: reading.keys.mask.clone(),
-        source: e,
-    })?;
-    Ok((masks, notes))
+    let (masks, key, _) = masks_of(&source, reading, &Field::default(), &mut Decided::default(), &mut notes)?;
+    Ok((checked(masks, &source.file, &key)?, notes))
 }

@@ -14,7 +14,7 @@ pub(super) const FULL_SCALES: [(u32, f32); 5] = [(8, 255.0), (10, 1023.0), (12, 
 /// Bright scenes and filters overshoot white a little.
 const OVERSHOOT: f32 = 2.0;
 /// Where the brightest hundredth of measurements lies, in units of a white that is to be believed.
-const BELIEVABLE: std::ops::RangeInclusive<f32> = 0.3..=1.3;
+pub(super) const BELIEVABLE: std::ops::RangeInclusive<f32> = 0.3..=1.3;
 /// How far the ratio of measurements to masked sums may be from the usual full scale, to stand for it.
 const NEAR: f32 = 0.1;
 /// The same of scales that are not usual.

@@ -65,7 +65,14 @@ impl Clip {
     pub(super) fn level(self, meas: ArrayView3<'_, f32>, open: ArrayView2<'_, f32>) -> (Option<f32>, Option<String>) {
         match self {
             Self::None => (None, None),
-            Self::Level(level) => (Some(level), None),
+            Self::Level(level) => {
+                let count = meas.iter().filter(|&&y| y >= level).count();
+                let share = 100.0 * count as f64 / meas.len().max(1) as f64;
+                let odd = (count == 0 || share > 50.0).then(|| {
+                    format!("data.sensor.clip = {level}, in the numbers of the file: {share:.0} % of the pixels are there or above")
+                });
+                (Some(level), odd)
+            }
             Self::Auto => match crowded(meas, open) {
                 None => (None, None),
                 Some((level, share)) => {

@@ -6,7 +6,8 @@ use sci_forward::{MaskError, MaskStack, ShiftingMasks};
 /// How a single mask makes those of all frames: frame t sees it at the offset t · `step`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MaskShift {
-    /// Pixels down and to the right from one frame to the next, of any sign, fractions too.
+    /// How far down and to the right each frame sees the pattern from where the one before did, in pixels of any sign, fractions too: frame t at
+    /// `(y, x)` sees the pattern at `(y, x) + t · step`, so that its image moves up and to the left.
     pub step: [f64; 2],
     /// B.
     pub frames: usize,
