@@ -290,3 +290,19 @@ fn what_does_not_go_with_bands_is_said() {
     said(&["memory=\"128 MB\""], "the lowest band of");
     said(&[BANDS, "data.calibration=auto"], "`data.calibration` does not go with bands");
 }
+
+/// A shaded border: nothing is measured there, and the rest is what it was.
+#[test]
+fn a_band_that_masks_leave_closed_is_black() {
+    let bench = bench();
+    let mut mask = masks();
+    mask.slice_mut(s![.., 300.., ..]).fill(0);
+    let mut npz = NpzWriter::new(fs::File::create(bench.path("scene.npz")).unwrap());
+    npz.add_array("mask", &mask).unwrap();
+    npz.add_array("orig", &video()).unwrap();
+    npz.finish().unwrap();
+    works(&bench, &["--out", "out", "--set", BANDS, "--set", "output=minimal"]);
+    let found = recon(&bench, "out");
+    assert!(found.slice(s![.., .., 700.., ..]).iter().all(|&v| v == 0.0));
+    assert!(found.slice(s![.., .., ..250, ..]).iter().all(|&v| v.is_finite()) && found[[0, 0, 100, 100]] > 0.05);
+}

@@ -403,3 +403,13 @@ fn read_noise_is_found_and_a_clean_scene_is_left_alone() {
     ]);
     assert!(run.code == 2 && run.stderr.contains("data.sensor.photons"), "{}", run.stderr);
 }
+
+#[test]
+fn masks_that_are_not_of_a_calibration_are_not_replaced() {
+    let bench = bench(&[]);
+    fs::create_dir(bench.path("mine")).unwrap();
+    bench.write("mine/masks.npy", b"mine");
+    let run = bench.sci(&["calibrate", "a.toml", "--out", "mine"]);
+    assert!(run.code == 2 && run.stderr.contains("masks.npy is there"), "{}", run.stderr);
+    assert_eq!(fs::read(bench.path("mine/masks.npy")).unwrap(), b"mine");
+}

@@ -495,3 +495,22 @@ fn a_report_keeps_its_size() {
     assert!(page.len() < 1_100_000, "{} bytes", page.len());
     assert!(page_data(&page)["images"][0]["step"].as_u64() > Some(1), "frames are left out");
 }
+
+/// Masks that are a folder of pictures are told from others of the same name.
+#[test]
+fn other_pictures_of_masks_are_another_run() {
+    let bench = bench(2);
+    ok(&bench, &["--out", "made", "--set", "data.measurements=[0]"]);
+    fs::rename(bench.path("made/frames"), bench.path("masks")).unwrap();
+    let (mut names, size) = (Vec::new(), 64);
+    for entry in fs::read_dir(bench.path("masks")).unwrap() {
+        names.push(entry.unwrap().path());
+    }
+    names.sort();
+    let y = Array3::from_shape_fn((2, size, size), |(k, i, j)| 0.5 + 0.01 * (k + i * j % 7) as f32);
+    bench.write("y.npy", npy(&y));
+    let sets = ["--out", "out", "--set", "data.path=y.npy", "--set", "data.mask=masks"];
+    ok(&bench, &[&sets[..], &["--shard", "1/2"]].concat());
+    fs::copy(&names[0], &names[1]).unwrap();
+    refused(&bench, &[&sets[..], &["--shard", "2/2"]].concat(), &["checksums"]);
+}

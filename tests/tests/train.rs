@@ -333,3 +333,16 @@ fn a_hostile_pickle_ends_with_a_message() {
         ends(&bench.sci(&["weights", "inspect", name]), 1, &[name, "not a .pth file"]);
     }
 }
+
+#[test]
+fn two_trainings_cannot_work_in_one_folder() {
+    let bench = bench(CONFIG);
+    let mut first = begin(&bench, &["--out", "out", "--set", "training.steps=100000"]);
+    e2e::wait_for(&bench.path("out/checkpoint.safetensors"));
+    let second = train(&bench, &["--set", "training.steps=100000", "--resume"]);
+    first.kill().unwrap();
+    first.wait().unwrap();
+    ends(&second, 2, &["another training is at work there"]);
+    // What a kill leaves is taken.
+    ends(&train(&bench, &["--set", "training.steps=100000", "--set", "data.patch=12", "--resume"]), 1, &["data.patch"]);
+}

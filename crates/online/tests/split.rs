@@ -176,7 +176,7 @@ fn weights_with_which_a_solve_diverges_are_not_kept() {
     let before = bytes(&net);
     let far = recipe().solve_to_the_end(&square, &mut exploding()).unwrap();
     assert!(far.is_none() && recipe().solve(&square, &mut exploding()).is_ok());
-    let record = adapt(&mut net, &square, &SplitConfig { learning_rate: 1e6, every: 2, ..CONFIG });
+    let record = adapt(&mut net, &square, &SplitConfig { learning_rate: 1.0, every: 2, ..CONFIG });
     assert!(record.kept == 0 && bytes(&net) == before, "{record:?}");
 }
 

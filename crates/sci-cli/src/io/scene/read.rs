@@ -596,10 +596,6 @@ pub fn read_video(path: &Path, reading: &Reading) -> Result<Video, SceneError> {
     let mut notes = Vec::new();
     let (array, key) = if source.is_named() {
         let names = source.names()?;
-        let Keys { orig, rgb, .. } = reading.keys.clone();
-        if let Some((key, part)) = names::lacking(&Keys { orig, rgb, ..Keys::default() }, &names, false) {
-            return Err(source.missing(key, part, names));
-        }
         let keys = names::resolved(&reading.keys, &names);
         let key = if names.contains(&keys.orig) { keys.orig.clone() } else { keys.rgb.clone() };
         let array = source.arrays(&[key.as_str()])?.arrays.remove(&key);
