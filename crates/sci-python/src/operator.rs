@@ -6,6 +6,7 @@ use ndarray::{Axis, Ix2, Ix3, IxDyn};
 use numpy::{PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use sci_cli::config::PATTERNS;
 use sci_cli::config::camera::of_arguments;
 use sci_cli::io::scene::{Keys, Truth, operator_of};
 use sci_cli::simulate::Camera;
@@ -94,14 +95,10 @@ pub(crate) fn operator(any: &Bound<'_, PyAny>) -> PyResult<Arc<dyn SensingOperat
 
 /// "rggb" and its like; `None` for a gray sensor.
 pub(crate) fn pattern(cfa: Option<&str>) -> PyResult<Option<CfaPattern>> {
-    let known = |name: &str| match name {
-        "rggb" => Ok(CfaPattern::Rggb),
-        "bggr" => Ok(CfaPattern::Bggr),
-        "grbg" => Ok(CfaPattern::Grbg),
-        "gbrg" => Ok(CfaPattern::Gbrg),
-        _ => Err(refused(format!("cfa = {name:?} is not legal; legal: \"rggb\", \"bggr\", \"grbg\", \"gbrg\", None"))),
-    };
-    cfa.map(known).transpose()
+    let known = |name: &str| PATTERNS.iter().find(|(known, _)| *known == name).map(|(_, pattern)| *pattern);
+    let illegal =
+        |name: &str| format!("cfa = {name:?} is not legal; legal: \"rggb\", \"bggr\", \"grbg\", \"gbrg\", None");
+    cfa.map(|name| known(name).ok_or_else(|| refused(illegal(name)))).transpose()
 }
 
 /// Masks whose pixels open independently of each other, [T, H, W], 0 or 1.

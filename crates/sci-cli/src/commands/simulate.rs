@@ -3,14 +3,16 @@
 use std::fs;
 use std::path::PathBuf;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use ndarray::{Array2, Axis, s};
 use sci_forward::{CfaPattern, Noise, VideoShape};
 
 use super::mask::Kind;
 use super::{Done, UsageError, array_format, parse_density};
 use crate::config::camera::of_arguments;
+use crate::config::{AXES, PATTERNS};
 use crate::io::output::{ArrayFormat, Part, write_arrays};
-use crate::io::scene::{self, Keys, Reading, Truth};
+use crate::io::scene::{self, Axes, Keys, Reading, Truth};
 use crate::simulate::{Camera, simulate};
 
 /// Arguments of `sci simulate`.
@@ -23,8 +25,11 @@ pub(super) struct Args {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Measure with a color sensor of this Bayer pattern; the scene then holds the RGB truth
-    #[arg(long, value_name = "PATTERN", value_enum)]
-    cfa: Option<Cfa>,
+    #[arg(long, value_name = "PATTERN", value_parser = named(&PATTERNS))]
+    cfa: Option<CfaPattern>,
+    /// Order of the axes of arrays: rows, columns, frames or frames, rows, columns [default: hwt in .mat, thw elsewhere]
+    #[arg(long, value_name = "ORDER", value_parser = named(&AXES))]
+    axes: Option<Axes>,
     /// How the masks' pixels open
     #[arg(long, value_enum, default_value = "random")]
     mask: Kind,
@@ -59,24 +64,10 @@ pub(super) struct Args {
     set: Vec<String>,
 }
 
-/// Bayer patterns on the command line.
-#[derive(Clone, Copy, Debug, clap::ValueEnum)]
-enum Cfa {
-    Rggb,
-    Bggr,
-    Grbg,
-    Gbrg,
-}
-
-impl From<Cfa> for CfaPattern {
-    fn from(cfa: Cfa) -> Self {
-        match cfa {
-            Cfa::Rggb => Self::Rggb,
-            Cfa::Bggr => Self::Bggr,
-            Cfa::Grbg => Self::Grbg,
-            Cfa::Gbrg => Self::Gbrg,
-        }
-    }
+/// One of some names, as the thing that it stands for.
+fn named<T: Copy + Send + Sync + 'static>(names: &'static [(&'static str, T)]) -> impl TypedValueParser<Value = T> {
+    let of = |text: String| names.iter().find(|(name, _)| *name == text).expect("one of the possible values").1;
+    PossibleValuesParser::new(names.iter().map(|(name, _)| *name)).map(of)
 }
 
 fn parse_sigma(text: &str) -> Result<f32, String> {
@@ -110,17 +101,17 @@ impl Args {
         let noise = Noise::new(self.photons, f64::from(self.sigma / 255.0))?;
         let (optics, readout) = of_arguments(&self.set, noise)?;
         let camera = Camera { optics, readout, seed: self.seed };
-        let cfa = self.cfa.map(CfaPattern::from);
+        let (cfa, reading) = (self.cfa, Reading { axes: self.axes, ..Reading::default() });
         let scene::Video { frames: mut truth, notes } = match cfa {
-            None => scene::read_gray_video(&self.video, &Reading::default())?,
-            Some(_) => scene::read_video(&self.video, &Reading::default())?,
+            None => scene::read_gray_video(&self.video, &reading)?,
+            Some(_) => scene::read_video(&self.video, &reading)?,
         };
         say(&notes);
         let (_, channels, height, width) = truth.dim();
         anyhow::ensure!(cfa.is_none() || channels == 3, "{}: --cfa needs a video in color", self.video.display());
         let masks = match &self.mask_file {
             Some(file) => {
-                let (masks, notes) = scene::read_mask(file, &Reading::default())?;
+                let (masks, notes) = scene::read_mask(file, &reading)?;
                 say(&notes);
                 masks
             }
@@ -160,6 +151,12 @@ impl Args {
             scene.len(),
             VideoShape { frames: scene.frames(), height, width }
         );
+        // Which pattern it is the file does not say.
+        if let Some((name, _)) =
+            PATTERNS.iter().find(|(_, pattern)| cfa == Some(*pattern) && *pattern != CfaPattern::default())
+        {
+            outln!("its sensor is not RGGB: run it with --set data.cfa={name}");
+        }
         Ok(Done::Complete)
     }
 }

@@ -71,8 +71,10 @@ pub struct RandomMask {
     pub seed: u64,
 }
 
-const AXES: [(&str, Axes); 2] = [("hwt", Axes::Hwt), ("thw", Axes::Thw)];
-const PATTERNS: [(&str, CfaPattern); 4] =
+/// The orders of axes by their names.
+pub(crate) const AXES: [(&str, Axes); 2] = [("hwt", Axes::Hwt), ("thw", Axes::Thw)];
+/// The patterns of color sensors by their names.
+pub const PATTERNS: [(&str, CfaPattern); 4] =
     [("rggb", CfaPattern::Rggb), ("bggr", CfaPattern::Bggr), ("grbg", CfaPattern::Grbg), ("gbrg", CfaPattern::Gbrg)];
 const DEFECTS: [(&str, Defects); 2] = [("keep", Defects::Keep), ("exclude", Defects::Exclude)];
 

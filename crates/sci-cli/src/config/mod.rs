@@ -27,7 +27,8 @@ use crate::solvers::{self, Solver, Start};
 use crate::table::{Paths, Source, Table};
 
 pub use crate::table::ConfigError;
-pub use data::{Calibration, Data, MaskSource, RandomMask, Simulate};
+pub(crate) use data::AXES;
+pub use data::{Calibration, Data, MaskSource, PATTERNS, RandomMask, Simulate};
 pub use online::Online;
 pub use output::Output;
 pub use skip::Skip;

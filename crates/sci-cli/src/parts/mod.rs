@@ -121,10 +121,13 @@ impl Site<'_> {
     /// If they are for others.
     pub fn fits(&self, channels: usize, weights: &Path) -> anyhow::Result<()> {
         let (scene, needed) = if self.cfa.is_some() { ("color", 3) } else { ("gray", 1) };
-        let mosaic = if channels == 3 { "; name its Bayer pattern in data.cfa if it is a mosaic" } else { "" };
+        let how = match channels {
+            3 => "; name its Bayer pattern in data.cfa if it is a mosaic",
+            _ => "; the experiments for color are color/fast, color/default, real/color and their like",
+        };
         anyhow::ensure!(
             channels == needed,
-            "denoiser.weights: {}: a network for {channels} channels, but the scene is {scene}: it needs one for {needed}{mosaic}",
+            "denoiser.weights: {}: a network for {channels} channels, but the scene is {scene}: it needs one for {needed}{how}",
             weights.display()
         );
         Ok(())

@@ -476,9 +476,18 @@ fn compare_at(key: &str, there: &Value, here: &Value, differences: &mut Vec<Stri
         (Value::Array(a), Value::Array(b)) if a.len() == b.len() && a.iter().any(Value::is_object) => {
             a.iter().zip(b).enumerate().for_each(|(i, (a, b))| compare_at(&below(&i.to_string()), a, b, differences));
         }
-        _ if there != here => differences.push(format!("`{key}` is {there} there and {here} here")),
+        _ if there != here => {
+            differences.push(format!("`{key}` is {} there and {} here", shortened(there), shortened(here)));
+        }
         _ => {}
     }
+}
+
+/// A value as far as it fits into a message.
+fn shortened(value: &Value) -> String {
+    const MOST: usize = 80;
+    let text = value.to_string();
+    if text.chars().count() <= MOST { text } else { text.chars().take(MOST).chain("…".chars()).collect() }
 }
 
 fn remove(path: &Path) -> io::Result<()> {

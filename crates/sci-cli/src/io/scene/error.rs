@@ -56,7 +56,7 @@ pub enum SceneError {
         expected: &'static str,
     },
     /// Two arrays of different picture sizes.
-    #[error("{file}: `{key}` is {}×{} (rows × columns), but `{mask}` is {}×{}; they must be equal. If frames are not where their axis is expected, data.axes says so: hwt (usual in .mat) or thw (elsewhere)", .size.0, .size.1, .mask_size.0, .mask_size.1)]
+    #[error("{file}: `{key}` is {}×{} (rows × columns), but `{mask}` is {}×{}; they must be equal. If frames are not where their axis is expected, data.axes (--axes of sci simulate) says so, for all files alike: hwt (usual in .mat) or thw (elsewhere)", .size.0, .size.1, .mask_size.0, .mask_size.1)]
     SizeMismatch {
         /// The file.
         file: String,

@@ -500,7 +500,7 @@ mod tests {
         let path = write_scene(dir.path(), Some(column_major((2, 3, 4), |_, _, _| 1e8 * 255.0)));
         let scene = read(&path, &Reading::default()).unwrap();
         assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1e8, 1.0));
-        assert!(scene.warnings[0].contains("white is taken to be 2.55e10"), "{:?}", scene.warnings);
+        assert!(scene.warnings[0].contains("white is taken to be 2.550e10"), "{:?}", scene.warnings);
         let scene = read(&path, &Reading { scale: Some(255.0), ..Reading::default() }).unwrap();
         assert_eq!((scene.unit, scene.y(1)[[1, 2]]), (1.0, 1e8));
     }

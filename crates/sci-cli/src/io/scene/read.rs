@@ -537,8 +537,8 @@ fn rescale(
     if PLAUSIBLE_WHITE.contains(&white) && !unknown {
         if unusual && has_unit {
             warnings.push(format!(
-                "the brightest hundredth is {white:.2} of white, which is taken to be {full}; data.scale = {:.4} would make it white",
-                white * full
+                "the brightest hundredth is {white:.2} of white, which is taken to be {full}; data.scale = {} would make it white",
+                four_digits(white * full)
             ));
         }
         if !unusual || has_unit {
@@ -561,10 +561,16 @@ fn rescale(
         () => "measurements are off their scale",
     };
     warnings.push(format!(
-        "{why}: white is taken to be {:e} (the brightest hundredth), and the result scaled likewise; data.scale fixes another",
-        white * full
+        "{why}: white is taken to be {} (the brightest hundredth), and the result scaled likewise; data.scale fixes another",
+        four_digits(white * full)
     ));
     white
+}
+
+/// A number above 0 as people write it, with four digits that mean something.
+fn four_digits(value: f32) -> String {
+    let digits = 3 - value.log10().floor() as i32;
+    if (-2..=7).contains(&digits) { format!("{value:.*}", digits.max(0) as usize) } else { format!("{value:.3e}") }
 }
 
 /// A video, and what is to be said about how it was read.
