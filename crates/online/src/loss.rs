@@ -238,7 +238,7 @@ fn gather(from: &Tensor, window: &Window) -> Result<Tensor> {
     Ok(Tensor::cat(&frames, 0)?)
 }
 
-fn values(tensor: &Tensor) -> Result<Vec<f32>> {
+pub(crate) fn values(tensor: &Tensor) -> Result<Vec<f32>> {
     Ok(tensor.flatten_all()?.to_vec1()?)
 }
 

@@ -17,6 +17,7 @@
 //! Yaman et al., *Self-supervised learning of physics-guided reconstruction neural networks without fully sampled reference data*, Magnetic
 //! Resonance in Medicine 2020; Yaman, Hosseini, Akçakaya, *Zero-shot self-supervised learning for MRI reconstruction*, ICLR 2022.
 
+use crate::loss::values;
 use crate::{Error, Result};
 use admm::Denoiser;
 use candle_core::{Tensor, Var};
@@ -436,10 +437,6 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
 const WARM_UP: f64 = 10.0;
 /// Longest gradient; longer ones are shortened to it.
 const CLIP_NORM: f64 = 1.0;
-
-fn values(var: &Var) -> Result<Vec<f32>> {
-    Ok(var.flatten_all()?.to_vec1()?)
-}
 
 #[cfg(test)]
 mod tests {

@@ -261,10 +261,7 @@ impl Measurement {
                 self.operator.forward(mosaic.view())
             }
         };
-        residual -= &self.y;
-        if let Some(level) = self.clip {
-            residual.zip_mut_with(&self.y, |r, &y| *r = if y >= level { r.min(0.0) } else { *r });
-        }
+        residual -= &self.y_against(residual.view());
         close(residual.view_mut(), self.operator.gram());
         Ok(residual)
     }
