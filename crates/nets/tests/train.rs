@@ -397,6 +397,7 @@ fn a_damaged_checkpoint_is_refused_and_the_one_before_it_used() {
     }
     // The damaged one is gone, so that the next does not take the place of the good one.
     assert!(!path.exists());
+    assert_eq!(trainer(&config).resume(&path).unwrap().from, folder.path().join("run.previous.safetensors"));
     std::fs::write(&path, &whole[..9]).unwrap();
     std::fs::remove_file(folder.path().join("run.previous.safetensors")).unwrap();
     let mut third = trainer(&config);

@@ -116,7 +116,7 @@ impl Sequence {
         let relation = known.as_ref().map(|(_, relation)| *relation);
         let cut = relation.is_some_and(|relation| relation.of_scene() > similarity.cut);
         let within = |limit: f64| !cut && relation.is_some_and(|relation| relation.of_start() <= limit);
-        let fresh = cut || self.config.reuse == Reuse::Reset || std::mem::take(&mut self.forgotten);
+        let fresh = std::mem::take(&mut self.forgotten) || cut || self.config.reuse == Reuse::Reset;
         let effort = if within(similarity.unchanged) { self.config.effort } else { 1.0 };
         let warm = known.filter(|_| within(similarity.warm)).map(|(video, _)| video);
         Task { index, measurement, relation, cut, effort, fresh, warm }

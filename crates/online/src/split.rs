@@ -150,7 +150,7 @@ pub struct Judgement {
     pub updates: usize,
     /// Mean of `(y − H T v)² / Σ C²` over the pixels predicted in the updates since the judgement before; nothing before the first update.
     pub hidden: Option<f64>,
-    /// The same over the pixels that judge.
+    /// The same over the pixels that judge; the largest number there is where a solve diverged.
     pub judged: f64,
 }
 
@@ -213,7 +213,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
     let judged = judging_crops(&scenes, config)?;
     let mut learner = Learner::new(net.clone(), config)?;
     let mut best = (learner.judge(&judged, recipe)?, 0, net.state());
-    let mut judgements = vec![Judgement { updates: 0, hidden: None, judged: best.0 }];
+    let mut judgements = vec![Judgement { updates: 0, hidden: None, judged: best.0.min(f64::MAX) }];
     let (mut hidden, mut since) = (Vec::new(), 0);
     for update in 1..=config.updates {
         let Some(loss) = learner.update(&scenes, recipe, update)? else { break };
@@ -224,7 +224,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
         }
         let error = learner.judge(&judged, recipe)?;
         let mean = hidden.drain(..).map(f64::from).fold((0.0, 0.0), |(sum, n), loss| (sum + loss, n + 1.0));
-        judgements.push(Judgement { updates: update, hidden: Some(mean.0 / mean.1), judged: error });
+        judgements.push(Judgement { updates: update, hidden: Some(mean.0 / mean.1), judged: error.min(f64::MAX) });
         since += 1;
         if error < best.0 {
             (best, since) = ((error, update, learner.blended()?), 0);
@@ -245,7 +245,7 @@ pub fn adapt_by_splitting<N: Network + Denoiser + Clone>(
             |given, then| Ok(next.recipe.solve_to_the_end(given, &mut Relay::new(Some(first), &mut **then))?),
         )
     });
-    let taken_over = taken_over.transpose()?;
+    let taken_over = taken_over.transpose()?.map(|error| error.min(f64::MAX));
     let ends_early = taken_over.is_some_and(|after| after > (1.0 + TIE) * best.0);
     Ok(SplitRecord { judgements, kept: best.1, taken_over, ends_early, seconds: begin.elapsed().as_secs_f64() })
 }

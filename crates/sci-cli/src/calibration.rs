@@ -151,8 +151,6 @@ impl Calibration {
     /// # Errors
     /// Names the file and what is wrong with it.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
-        // The folder that `sci calibrate` wrote it to means it.
-        let path = if path.is_dir() { &path.join("calibration.json") } else { path };
         let read = || -> anyhow::Result<Self> {
             let found: Self = serde_json::from_slice(&read_file(path)?)?;
             anyhow::ensure!(found.schema == SCHEMA, "its schema is {}, expected {SCHEMA}", found.schema);

@@ -299,6 +299,11 @@ impl<'e> Factory<'e> {
         Ok(())
     }
 
+    /// Whether a measurement takes something over from the one before, or from its own band in the middle.
+    pub fn takes_over(&self) -> bool {
+        self.needs_weights() || self.needs_previous() || self.experiment.online.is_some()
+    }
+
     /// Reads what [`Factory::save_weights`] wrote, if networks go from measurement to measurement as they are.
     ///
     /// # Errors

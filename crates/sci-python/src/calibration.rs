@@ -36,7 +36,7 @@ use crate::reconstruct::say;
 ///     As they are. Pixels that are not to be used are closed in all frames.
 /// calibration : dict
 ///     Each parameter with its uncertainty. Written to a file by json.dump it is what data.calibration of an experiment takes; its
-///     "black" (in units of white) is to be taken off measurements that are solved otherwise.
+///     "black" times "white" is to be taken off measurements that are solved otherwise.
 #[pyfunction]
 #[pyo3(signature = (measurement, masks, *, cfa=None, reach=2.0, clock=false))]
 pub(crate) fn calibrate<'py>(

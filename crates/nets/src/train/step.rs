@@ -546,7 +546,8 @@ impl Trainer {
                 let Ok(found) = checkpoint::read(&before) else { return Err(error) };
                 self.restore(&before, found)?;
                 // The next one to be saved would put it in the place of this one.
-                std::fs::remove_file(path).map_err(|source| Error::Write { path: path.to_owned(), source })?;
+                let aside = std::fs::rename(path, path.with_extension("refused.safetensors"));
+                aside.or_else(missing_is_fine).map_err(|source| Error::Write { path: path.to_owned(), source })?;
                 Ok(Resumed { from: before, refused: Some(error) })
             }
         }
@@ -563,7 +564,8 @@ impl Trainer {
         match checkpoint::read(&before) {
             Ok(found) => {
                 self.restore(&before, found)?;
-                std::fs::remove_file(path).map_err(|source| Error::Write { path: path.to_owned(), source })?;
+                let given_up = std::fs::remove_file(path).or_else(missing_is_fine);
+                given_up.map_err(|source| Error::Write { path: path.to_owned(), source })?;
             }
             Err(_) => self.restore(path, checkpoint::read(path)?)?,
         }
@@ -610,6 +612,10 @@ impl Trainer {
         self.rate = meta.rate;
         Ok(())
     }
+}
+
+fn missing_is_fine(error: std::io::Error) -> std::io::Result<()> {
+    if error.kind() == std::io::ErrorKind::NotFound { Ok(()) } else { Err(error) }
 }
 
 fn values(var: &Var) -> Result<Vec<f32>> {

@@ -257,7 +257,7 @@ fn files_of(path: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files = fs::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
     files.retain(|file| file.is_file() && file.extension().is_some_and(|e| e == "npy"));
     if files.is_empty() {
-        return frames::list(path).map_err(io::Error::other);
+        return frames::list_all(path).map_err(io::Error::other);
     }
     files.sort();
     Ok(files)

@@ -196,7 +196,12 @@ fn calibration(t: &mut Table<'_>) -> Calibration {
     if t.word("calibration", "auto") {
         return Calibration::Auto;
     }
-    if t.holds("calibration") { Calibration::File(t.path("calibration")) } else { Calibration::None }
+    if !t.holds("calibration") {
+        return Calibration::None;
+    }
+    let path = t.path("calibration");
+    // The folder that `sci calibrate` wrote it to means it.
+    Calibration::File(if path.is_dir() { path.join("calibration.json") } else { path })
 }
 
 fn part_names(t: &mut Table<'_>) -> Keys {

@@ -21,6 +21,14 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
     list_named(folder, &["png", "jpg", "jpeg"])
 }
 
+/// Those of which [`read`] makes a video: pages of TIFF files too.
+///
+/// # Errors
+/// As [`list`].
+pub fn list_all(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    list_named(folder, &["png", "jpg", "jpeg", "tif", "tiff"])
+}
+
 fn list_named(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, FileError> {
     let io = |source| FileError::new(folder, ReadError::Io(source));
     let mut paths = Vec::new();
@@ -66,7 +74,7 @@ fn natural_key(name: &str) -> Vec<(String, u64)> {
 /// # Errors
 /// [`FileError`] naming the folder or the frame at fault.
 pub fn read(folder: &Path) -> Result<Array, FileError> {
-    let paths = list_named(folder, &["png", "jpg", "jpeg", "tif", "tiff"])?;
+    let paths = list_all(folder)?;
     let mut pictures: Vec<Array> = Vec::with_capacity(paths.len());
     for path in &paths {
         let bytes = read_file(path)?;

@@ -4,7 +4,7 @@
 //! of HDF5 (MATLAB's v7.3 among it) the chunks are read that are needed. What other formats hold has to be read whole.
 
 use std::fs::File;
-use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -166,7 +166,13 @@ impl Stored {
         let copied = io::copy(&mut member.by_ref().take(wanted), &mut unpacked);
         // The checksum of a member is compared at its end.
         let found = copied.and_then(|found| io::copy(&mut member, &mut io::sink()).map(|_| found));
-        let found = found.map_err(|e| error(ReadError::Malformed { format: ".npz", reason: e.to_string() }))?;
+        let damaged = |e: &io::Error| {
+            matches!(e.kind(), ErrorKind::InvalidData | ErrorKind::InvalidInput | ErrorKind::UnexpectedEof)
+        };
+        let found = found.map_err(|e| match damaged(&e) {
+            true => error(ReadError::Malformed { format: ".npz", reason: e.to_string() }),
+            false => error(ReadError::Io(e)),
+        })?;
         if found < wanted {
             return Err(error(self.header.cut_short(found)));
         }

@@ -309,7 +309,7 @@ function adaptation(measurements) {
   table(section("Adaptation"), ["measurement", "updates", "error of hidden pixels", "error of judging pixels", "in use", "seconds"],
     measurements.flatMap(m => {
       const s = m.online.split;
-      const row = (updates, hidden, judged, used) => ({ warning: false, cells: [`${m.index}`, updates, small(hidden), small(judged), used ? "yes" : "", show(s.seconds, 1)] });
+      const row = (updates, hidden, judged, used) => ({ warning: false, cells: [`${m.index}`, updates, small(hidden), judged > 1e300 ? "diverged" : small(judged), used ? "yes" : "", show(s.seconds, 1)] });
       const rows = s.judgements.map(j => row(`${j.updates}`, j.hidden, j.judged, j.updates === s.kept));
       return s.taken_over == null ? rows : [...rows, row("the network after it", undefined, s.taken_over, !s.ends_early)];
     }));

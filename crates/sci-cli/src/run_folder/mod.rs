@@ -41,7 +41,7 @@ pub const RECORD: &str = "record.json";
 const STAGING: &str = ".sci-run";
 /// [`STAGING`] once it is not needed any more: a run that is killed while it clears up is finished.
 const FINISHED: &str = ".sci-run-finished";
-const LOCK: &str = "lock";
+pub(crate) const LOCK: &str = "lock";
 const RUN: &str = "run.json";
 const OURS: &str = "ours.json";
 const OUT: &str = "out";
@@ -417,7 +417,7 @@ fn measurement_name(index: usize) -> String {
 }
 
 /// Takes the lock of a staging folder, until the file is dropped; nothing if someone else has it.
-fn locked(staging: &Path) -> anyhow::Result<Option<File>> {
+pub(crate) fn locked(staging: &Path) -> anyhow::Result<Option<File>> {
     fs::create_dir_all(staging).map_err(fail(staging))?;
     let path = staging.join(LOCK);
     let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(fail(&path))?;

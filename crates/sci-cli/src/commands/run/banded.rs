@@ -107,7 +107,9 @@ impl Cut {
             release_freed_memory();
             let scene = match self.scene.band(k, self.bands.solved(band)) {
                 // A shaded border: nothing is measured, and nothing to be found.
-                Err(SceneError::Mask { source: MaskError::AllClosed, .. }) => {
+                Err(SceneError::Mask { source: MaskError::AllClosed, .. })
+                    if band != middle || !factory.takes_over() =>
+                {
                     let [frames, channels, _, width] = self.shape();
                     let video = Array4::zeros((frames, channels, self.bands.kept(band).len(), width));
                     let record =

@@ -4,7 +4,6 @@ mod data;
 mod log;
 mod run;
 
-use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -13,6 +12,7 @@ use nets::kernels::keep_freed_memory;
 use nets::train::Trainer;
 
 use super::{Done, UsageError, catch_interrupts, check_folder};
+use crate::run_folder::{LOCK, locked};
 use crate::training::{CHECKPOINT, Training};
 use log::Log;
 use run::Run;
@@ -54,13 +54,10 @@ impl Args {
         }
         outln!("{}, {} parameters", trainer.describe(), trainer.parameter_count());
         std::fs::create_dir_all(&files.folder).with_context(|| format!("cannot create {}", files.folder.display()))?;
-        let lock = files.folder.join(LOCK);
-        let held = File::create(&lock).with_context(|| format!("cannot write {}", lock.display()))?;
-        if matches!(held.try_lock(), Err(TryLockError::WouldBlock)) {
-            return Err(
-                UsageError(format!("--out {}: another training is at work there", files.folder.display())).into()
-            );
-        }
+        let Some(held) = locked(&files.folder)? else {
+            let folder = files.folder.display();
+            return Err(UsageError(format!("--out {folder}: another training is at work there")).into());
+        };
         if self.resume {
             let resumed = trainer.resume(&files.checkpoint)?;
             if let Some(error) = resumed.refused {
@@ -69,16 +66,13 @@ impl Args {
             outln!("resumed at step {}", trainer.steps_done());
         }
         let log = Log::open(&files.log, trainer.steps_done())?;
+        let lock = files.folder.join(LOCK);
         let done = Run::new(trainer, log, files).finish();
+        std::fs::remove_file(lock).ok();
         drop(held);
-        // Nobody waits for it: who finds it taken goes away.
-        std::fs::remove_file(&lock).ok();
         done
     }
 }
-
-/// Held by the training that is at work in a folder.
-const LOCK: &str = ".lock";
 
 /// The files of a run.
 struct Files {

@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use ndarray::{Array2, Axis, concatenate, s};
-use sci_forward::{CfaPattern, VideoShape};
+use sci_forward::{CfaPattern, MaskError, VideoShape};
 
 use super::layout::{FileAxes, Place};
 use super::read::{Parts, assembled};
@@ -177,6 +177,9 @@ impl Banded {
         let mut part = self.part(&[0], &spread)?;
         // Pixels of two blocks are no neighbours, and have other rows here.
         part.warnings.retain(|note| !defects::is_note(note));
+        for note in part.warnings.iter_mut().filter(|note| note.starts_with(|c: char| c.is_ascii_digit())) {
+            *note = format!("of the rows that were looked at, {note}");
+        }
         if part.unit != 1.0 && self.truth.is_some() {
             let why = "neither measurements nor truth are on a usual scale; say in data.scale what white is".into();
             return Err(SceneError::NotInBands { file: self.file.clone(), why });
@@ -286,7 +289,13 @@ impl Banded {
             let black = self.reading.sensor.black;
             return Ok(stored.index_axis_move(Axis(0), 0).mapv(|y| (y - black) / decided.meas / decided.unit));
         }
-        let strips = self.strips().map(|rows| Ok(self.band(k, rows)?.y(0).to_owned()));
+        let strip = |rows: Range<usize>| match self.band(k, rows.clone()) {
+            Err(SceneError::Mask { source: MaskError::AllClosed, .. }) => {
+                Ok(Array2::zeros((rows.len(), self.shape.width)))
+            }
+            scene => Ok(scene?.y(0).to_owned()),
+        };
+        let strips = self.strips().map(strip);
         let strips = strips.collect::<Result<Vec<Array2<f32>>, SceneError>>()?;
         let views: Vec<_> = strips.iter().map(|strip| strip.view()).collect();
         Ok(concatenate(Axis(0), &views).expect("strips of one width"))
@@ -453,7 +462,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_that_are_not_plain_and_folders_are_read_whole() {
+    fn shapes_that_are_not_plain_are_read_whole() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scene.npz");
         let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());

@@ -225,7 +225,7 @@ fn twelve_bits_in_sixteen_are_said() {
     let reading = Reading { mask: Some(dir.npy("mask.npy", &mask())), ..Reading::default() };
     let scene = super::read(&dir.tiff16("meas.tif", &meas()), &reading).unwrap();
     assert!(scene.warnings[0].contains("white is taken to be 4095"), "{:?}", scene.warnings);
-    assert!(scene.warnings[1].contains("darker or brighter than scenes are"), "{:?}", scene.warnings);
+    assert!(scene.warnings[1].contains("darker than scenes are"), "{:?}", scene.warnings);
     let worst = (&scene.measurements * scene.unit - &(meas() / 4095.0)).fold(0f32, |worst, d| worst.max(d.abs()));
     assert!(worst < 1e-6, "{worst}");
     let video =
@@ -311,7 +311,7 @@ fn captures_that_are_dark_are_brought_to_white_unless_noise_is_told_in_it() {
     let (mask, meas) = bright(0.1);
     let scene = of(mask.clone(), meas.clone(), &Reading::default());
     assert!((0.05..0.15).contains(&scene.unit), "{}", scene.unit);
-    assert!(scene.warnings[0].contains("darker or brighter than scenes are"), "{:?}", scene.warnings);
+    assert!(scene.warnings[0].contains("darker than scenes are"), "{:?}", scene.warnings);
     let mut reading = Reading::default();
     reading.sensor.noise = SensorNoise::Known(Noise::new(None, 0.01).unwrap());
     let scene = of(mask, meas, &reading);
@@ -347,9 +347,20 @@ fn pictures_of_zeros_and_ones_are_open_where_they_are_one() {
 }
 
 #[test]
-fn a_level_that_nothing_reaches_is_noticed() {
+fn a_level_that_most_pixels_reach_is_noticed() {
     let (mask, meas) = bright(0.8);
     let mut reading = Reading { scale: Some(1.0), ..Reading::default() };
-    reading.sensor.clip = Clip::Level(1000.0);
-    assert!(of(mask, meas, &reading).warnings[0].contains("data.sensor.clip = 1000"));
+    reading.sensor.clip = Clip::Level(0.01);
+    assert!(of(mask, meas, &reading).warnings[0].contains("data.sensor.clip = 0.01"));
+}
+
+#[test]
+fn a_video_whose_frames_seem_to_be_its_last_axis_is_noticed() {
+    let dir = Folder::new();
+    let notes = |dim, axes| {
+        let path = dir.npy("video.npy", &Array3::from_elem(dim, 0.5));
+        read_video(&path, &Reading { axes, ..Reading::default() }).unwrap().notes
+    };
+    assert!(notes((40, 48, 8), None)[0].contains("40 frames of 48×8"));
+    assert!(notes((40, 48, 8), Some(Axes::Hwt)).is_empty() && notes((8, 40, 48), None).is_empty());
 }

@@ -13,15 +13,16 @@ pub(super) fn doubt(open: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, lattice: 
     let y = fine(y, lattice)?;
     let with = |open: ArrayView2<'_, f32>| correlation(fine(open, lattice)?.view(), y.view());
     let told = with(open)?;
-    if told >= TOGETHER {
+    if y.len() < FEWEST || told >= TOGETHER {
         return None;
     }
+    let elsewhere = elsewhere(&fine(open, lattice)?, &y);
     let turned = (0..8).filter_map(|turn| {
         let turned = turned(open, turn);
         Some((turn, with(turned)?))
     });
     let (turn, found) = turned.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))?;
-    (found.abs() >= MEANT).then(|| {
+    (found.abs() >= MEANT.max(elsewhere)).then(|| {
         let how = HOW.iter().enumerate().filter(|(bit, _)| turn >> bit & 1 == 1).map(|(_, how)| *how);
         let how = how.chain((found < 0.0).then_some("inverted (1 − mask)")).collect::<Vec<_>>().join(" and ");
         format!(
@@ -29,6 +30,24 @@ pub(super) fn doubt(open: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, lattice: 
             found.abs()
         )
     })
+}
+
+/// Of fewer pixels one of eight turns goes with any measurement by chance.
+const FEWEST: usize = 1000;
+/// How many pixels masks may sit off.
+const OFF: usize = 3;
+
+/// How well masks go with a measurement if they are moved by some pixels, at best: then they are not turned, though they go against what is
+/// measured beside them.
+fn elsewhere(open: &Array2<f32>, y: &Array2<f32>) -> f32 {
+    let (height, width) = y.dim();
+    if height.min(width) <= 4 * OFF {
+        return 0.0;
+    }
+    let inside = y.slice(s![OFF..height - OFF, OFF..width - OFF]);
+    let offsets = (0..=2 * OFF).flat_map(|i| (0..=2 * OFF).map(move |j| (i, j))).filter(|&at| at != (OFF, OFF));
+    let moved = |(i, j)| correlation(open.slice(s![i..i + height - 2 * OFF, j..j + width - 2 * OFF]), inside);
+    offsets.filter_map(moved).fold(0.0, f32::max)
 }
 
 /// What the bits of a turn do to masks, the last one first.
@@ -75,7 +94,7 @@ mod tests {
 
     #[test]
     fn masks_that_are_turned_or_inverted_are_named_and_others_are_not() {
-        let shape = VideoShape { frames: 6, height: 30, width: 30 };
+        let shape = VideoShape { frames: 6, height: 48, width: 48 };
         let masks = MaskStack::random(shape, 0.4, 5).unwrap();
         let video = Array3::from_shape_fn(shape.dim(), |(t, i, j)| 0.4 + 0.3 * ((t + i + 2 * j) as f32 / 9.0).sin());
         let y = (&masks.view() * &video).sum_axis(Axis(0));
@@ -91,10 +110,16 @@ mod tests {
             assert!(
                 doubt(open.mapv(|open| 6.0 - open).view(), y.view(), lattice).unwrap().contains("they would, inverted")
             );
+            // A pixel off, and half of one.
+            for by in [1.0, 0.5] {
+                let beside = open.slice(s![.., 1..]).mapv(|open| by * open);
+                let moved = &beside + &open.slice(s![.., ..47]).mapv(|open| (1.0 - by) * open);
+                assert_eq!(doubt(moved.view(), y.slice(s![.., ..47]), lattice), None);
+            }
             // Of another camera, even masks, and pictures of a pixel.
             let other = MaskStack::random(shape, 0.4, 6).unwrap().view().sum_axis(Axis(0));
             assert_eq!(doubt(other.view(), y.view(), lattice), None);
-            assert_eq!(doubt(Array2::ones((30, 30)).view(), y.view(), lattice), None);
+            assert_eq!(doubt(Array2::ones((48, 48)).view(), y.view(), lattice), None);
             assert_eq!(doubt(Array2::ones((1, 1)).view(), Array2::ones((1, 1)).view(), lattice), None);
         }
     }

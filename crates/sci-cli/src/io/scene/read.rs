@@ -521,7 +521,7 @@ fn look_for_defects(
 }
 
 /// Brings measurements that are far off their scale, or have none as their masks were in a unit of their own, and truth that is too, to
-/// one on which the brightest hundredth is white; returns what white was. Without a truth, dark and bright ones are brought there too, as a camera's
+/// one on which the brightest hundredth is white; returns what white was. Without a truth, dark ones are brought there too, as a camera's
 /// numbers end with the light of all frames, of which one has a part, and networks know scenes of usual brightness best; but not where noise is told
 /// in units of white (`has_unit`), which in the file is `full`.
 fn rescale(
@@ -533,7 +533,7 @@ fn rescale(
 ) -> f32 {
     let Some(white) = brightest_light(meas.view(), mask.view()) else { return 1.0 };
     let unknown = in_own_unit && truth.is_none();
-    let unusual = truth.is_none() && !scale::BELIEVABLE.contains(&white);
+    let unusual = truth.is_none() && white < *scale::BELIEVABLE.start();
     if PLAUSIBLE_WHITE.contains(&white) && !unknown {
         if unusual && has_unit {
             warnings.push(format!(
@@ -557,7 +557,7 @@ fn rescale(
     }
     let why = match () {
         () if unknown => "masks are in a unit of their own",
-        () if PLAUSIBLE_WHITE.contains(&white) => "measurements are darker or brighter than scenes are",
+        () if PLAUSIBLE_WHITE.contains(&white) => "measurements are darker than scenes are",
         () => "measurements are off their scale",
     };
     warnings.push(format!(
@@ -619,7 +619,15 @@ pub fn read_video(path: &Path, reading: &Reading) -> Result<Video, SceneError> {
         return Err(SceneError::TooFewFrames { file: source.file, frames: 1, needed: 2 });
     }
     let white = white_of_video(&place, &array, reading, &mut notes);
-    Ok(Video { frames: place.channels(&array, white)?, notes })
+    let frames = place.channels(&array, white)?;
+    let (count, _, height, width) = frames.dim();
+    // A few columns of many frames are more likely frames.
+    if reading.axes.is_none() && !place.is_picture() && 4 * width < count.min(height) {
+        notes.push(format!(
+            "`{key}`: {count} frames of {height}×{width}; if the last axis are the frames, data.axes = \"hwt\" (--axes hwt of sci simulate) says so"
+        ));
+    }
+    Ok(Video { frames, notes })
 }
 
 /// A video `[T, C, H, W]`, C = 1 or 3, as luma `[T, 1, H, W]`.

@@ -68,7 +68,7 @@ impl Clip {
             Self::Level(level) => {
                 let count = meas.iter().filter(|&&y| y >= level).count();
                 let share = 100.0 * count as f64 / meas.len().max(1) as f64;
-                let odd = (count == 0 || share > 50.0).then(|| {
+                let odd = (share > 50.0).then(|| {
                     format!("data.sensor.clip = {level}, in the numbers of the file: {share:.0} % of the pixels are there or above")
                 });
                 (Some(level), odd)

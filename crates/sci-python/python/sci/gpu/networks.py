@@ -87,14 +87,15 @@ def place(channel, old, new):
     return group * new + channel - group * old
 
 
-def widened(own, weight):
-    """A smaller layer within a larger one: its channels do not listen to the new ones."""
+def widened(own, weight, is_first):
+    """A smaller layer within a larger one: its channels do not listen to the new ones. What the first layer is shown grows at its beginning."""
     new = own.detach().cpu().clone()
     rows = [place(o, weight.shape[0], own.shape[0]) for o in range(weight.shape[0])]
     if own.dim() == 1:
         new[rows] = weight
         return new
-    columns = [place(i, weight.shape[1], own.shape[1]) for i in range(weight.shape[1])]
+    has, wants = weight.shape[1], own.shape[1]
+    columns = [wants - has + i if is_first else place(i, has, wants) for i in range(has)]
     for output, row in enumerate(rows):
         new[row] = 0
         new[row, columns] = weight[output]
@@ -104,7 +105,7 @@ def widened(own, weight):
 class Shiftnet(Network):
     """See `nets::Shiftnet`. Called with a video `[b, T, C, H, W]`, sides multiples of 8, and a σ in 0..255 units."""
 
-    def __init__(self, channels, widths, blocks, window=3, experts=(), device="cpu", seed=0):
+    def __init__(self, channels, widths, blocks, window=1, experts=(), device="cpu", seed=0):
         super().__init__(device)
         self.window, self.experts = window, list(experts)
         self.steps, layers = shiftnet_layers(4 * window * channels + 1, 4 * channels, widths, blocks)
@@ -131,7 +132,7 @@ class Shiftnet(Network):
             for name, p in self.params.items():
                 if name.startswith(prefix + "body."):
                     weight = state[old + name[len(prefix) :]].float()
-                    p.data.copy_(weight if weight.shape == p.shape else widened(p, weight))
+                    p.data.copy_(weight if weight.shape == p.shape else widened(p, weight, name.endswith("input.weight")))
 
     def expert(self, sigma):
         return self.prefixes[sum(sigma < bound - 1e-3 for bound in self.experts)]

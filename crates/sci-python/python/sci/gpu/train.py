@@ -4,8 +4,9 @@ It takes the same files, of a ShiftNet with `iterates.unrolled = true` and of a 
 
 * The clips of a step have one number of frames, drawn from those in `camera.frames` that divide 8 `data.batch`, and are as many as make 8
   `data.batch` frames.
-* The loss is PSNR, layers multiply in bf16 on a GPU, Muon takes the steps, and no channel begins anew: `training.loss`, `precision`, `optimizer`,
-  `revive` and the keys of `[noise]` beside `sigma` have no effect.
+* The loss is PSNR, layers multiply in bf16 on a GPU, Muon takes the steps, no channel begins anew, and what is reported and saved is what is so every
+  20 seconds: `training.loss`, `precision`, `optimizer` and `revive`, `[validation]` and `[checkpoint]` have no effect.
+* A quarter of the clips is seen in another exposure. Weights are written in 16 bits.
 * With `--minutes` training ends after that time instead of `training.steps`, the learning rate with it.
 """
 
@@ -29,6 +30,15 @@ try:
 except ImportError:  # before Python 3.11
     import tomli as tomllib
 
+#: The keys of a file, by the table that they are in.
+KEYS = {
+    "": "name seed weights network data camera iterates noise training validation checkpoint",
+    "data": "video photos validation photo_share patch frames batch",
+    "camera": "frames density masks noise noisy holes saturated mask_errors mask_grain",
+    "iterates": "sigmas start_iterations calls unrolled",
+    "noise": "sigma",
+    "training": "steps learning_rate final_learning_rate warmup average clip_norm loss precision optimizer revive",
+}
 #: mse below which a clip is as good as it needs to be, 45 dB.
 GOOD = 3e-5
 REPORT_SECONDS = 20
@@ -81,6 +91,7 @@ class Training:
     """What is trained, and on what."""
 
     def __init__(self, config, folder, device):
+        check_keys(config)
         self.config, self.device, self.compiled = config, device, False
         self.rng = np.random.default_rng(config.get("seed", 0))
         data, network = config["data"], dict(config["network"])
@@ -88,13 +99,14 @@ class Training:
         seed = config.get("seed", 0)
         torch.manual_seed(seed)
         clips = read_clips(found("data.video", data["video"], folder), self.channels, device)
-        photos = read_photos(found("data.photos", data["photos"], folder), self.channels, device)
+        share = data.get("photo_share", 0.5)
+        photos = read_photos(found("data.photos", data["photos"], folder), self.channels, device) if share > 0 else []
         self.validation = read_clips(found("data.validation", data["validation"], folder), self.channels, device)
-        self.clips = Clips(clips, photos, data.get("photo_share", 0.5), data["patch"], device, self.rng)
+        self.clips = Clips(clips, photos, share, data["patch"], device, self.rng)
         if self.kind == "shiftnet":
             iterates = config["iterates"]
-            if not iterates.get("unrolled") or "first" in iterates:
-                raise ValueError("iterates: on a GPU ShiftNet is trained with unrolled = true and no first calls; other files: sci train")
+            if not iterates.get("unrolled") or "noise" in config:
+                raise ValueError("iterates: on a GPU ShiftNet is trained with unrolled = true and without [noise]; other files: sci train")
             self.network = Shiftnet(**network, device=device, seed=seed)
             self.cameras = Cameras(config["camera"], device, self.rng)
         elif self.kind == "fastdvdnet" and "iterates" not in config:
@@ -115,7 +127,7 @@ class Training:
         """Clips and frames of a step."""
         images = 8 * self.config["data"]["batch"]
         if self.kind == "fastdvdnet":
-            frames = self.config["data"].get("frames", 5)
+            frames = self.config["data"].get("frames", 1)
         else:
             low, high = self.config["camera"]["frames"]
             legal = [n for n in range(low, high + 1) if images % n == 0]
@@ -130,8 +142,7 @@ class Training:
             clean = self.clips.batch(*self.counts())
         if self.kind == "fastdvdnet":
             low, high = self.config["noise"]["sigma"]
-            # Low levels, with which a solve ends, come more often.
-            sigma = (low + (high - low) * torch.rand(len(clean), device=self.device) ** 1.5) / 255
+            sigma = (low + (high - low) * torch.rand(len(clean), device=self.device)) / 255
             noisy = clean + sigma.reshape(-1, 1, 1, 1, 1) * torch.randn_like(clean)
             self.network.training = True
             return decibels(self.network(noisy, sigma), clean)
@@ -183,6 +194,15 @@ class Training:
 
 def decibels(result, clean):
     return 10 * torch.log10(((result - clean) ** 2).mean((1, 2, 3, 4)) + GOOD).mean()
+
+
+def check_keys(config):
+    for table, known in KEYS.items():
+        part = config if table == "" else config.get(table, {})
+        for key in part:
+            if key not in known.split():
+                place = f"{table}.{key}" if table else key
+                raise ValueError(f"{place} is no key, or one of sci train alone; legal here: {known.replace(' ', ', ')}")
 
 
 def found(key, path, folder):
@@ -266,7 +286,9 @@ class Run:
         self.with_average(lambda: write_weights(self.out / f"{name}.safetensors", self.training.network.weights()))
         state = {"params": {name: p.data for name, p in self.params.items()}, "average": self.average, "muon": self.muon.state()}
         state |= {"step": self.steps_done, "seconds": self.elapsed(), "rng": self.training.rng.bit_generator.state}
-        state |= {"stats": getattr(self.training.network, "stats", {})}
+        state |= {"stats": getattr(self.training.network, "stats", {}), "torch": torch.get_rng_state()}
+        if self.training.device.startswith("cuda"):
+            state["cuda"] = torch.cuda.get_rng_state(self.training.device)
         torch.save(state, self.out / "checkpoint.tmp")
         os.replace(self.out / "checkpoint.tmp", self.out / "checkpoint.pt")
 
@@ -275,6 +297,9 @@ class Run:
         self.training.network.set(state["params"])
         self.average, self.steps_done, self.seconds = state["average"], state["step"], state["seconds"]
         self.training.rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch"].cpu())
+        if "cuda" in state and self.training.device.startswith("cuda"):
+            torch.cuda.set_rng_state(state["cuda"].cpu(), self.training.device)
         self.muon.set_state(state["muon"])
         for name, value in state["stats"].items():
             self.training.network.stats[name].copy_(value)
