@@ -85,11 +85,14 @@ fn open_file(path: &Path) -> Result<Hdf5File, ReadError> {
     Hdf5File::open_with_options(path, options(limit)).map_err(bad)
 }
 
-/// The arrays of plain real numbers in a file, with their shapes and types, whether parts of them can be read, and whether MATLAB wrote them.
+/// An array's name, shape and type, and whether parts of it can be read.
+pub(super) type Found = (String, Header, bool);
+
+/// The arrays of plain real numbers in a file, and whether MATLAB wrote them.
 ///
 /// # Errors
 /// [`ReadError`] for damaged bytes.
-pub(super) fn headers(path: &Path) -> Result<(Vec<(String, Header, bool)>, bool), ReadError> {
+pub(super) fn headers(path: &Path) -> Result<(Vec<Found>, bool), ReadError> {
     let file = open_file(path)?;
     let root = file.root_group().map_err(bad)?;
     let mut names = Vec::new();

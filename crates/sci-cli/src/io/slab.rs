@@ -68,7 +68,7 @@ pub fn arrays(path: &Path) -> Result<Option<Arrays>, FileError> {
         Ok(Format::Npz) => Ok(Some(Arrays { named: in_archive(path, file).map_err(error)?, format: Format::Npz })),
         Ok(Format::Hdf5 | Format::Mat) if hdf5::is_hdf5(&beginning) => {
             let (found, of_matlab) = hdf5::headers(path).map_err(error)?;
-            let stored = |(name, header, in_parts): (String, Header, bool)| {
+            let stored = |(name, header, in_parts): hdf5::Found| {
                 let place = if in_parts { Place::Dataset(name.clone()) } else { Place::Whole };
                 (name, Stored { path: path.to_owned(), place, header })
             };

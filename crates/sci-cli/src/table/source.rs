@@ -75,7 +75,7 @@ pub fn read_text(path: &Path, what: &str) -> Result<String, String> {
         Ok(bytes)
     };
     let bytes = read().map_err(|e: io::Error| {
-        let known = (e.kind() == io::ErrorKind::NotFound).then(|| shipped::like(path)).unwrap_or_default();
+        let known = if e.kind() == io::ErrorKind::NotFound { shipped::like(path) } else { String::new() };
         format!("cannot read the {what} file: {e}{known}")
     })?;
     if bytes.len() as u64 > MOST_BYTES {
