@@ -308,6 +308,10 @@ fn weight_files_are_shown_and_converted() {
     let shown = bench.sci(&["weights", "inspect", "half.safetensors"]).stdout;
     assert!(shown.contains("F16") && shown.contains("FFDNet (gray, 4 channels, 3 layers, residual)"), "{shown}");
 
+    ends(&bench.sci(&["weights", "blend", "net.safetensors", "net.safetensors", "0.25", "same.safetensors"]), 0, &[]);
+    let half_way = ["weights", "blend", "bundled:ffdnet_gray", "net.safetensors", "0.5", "no.safetensors"];
+    ends(&bench.sci(&half_way), 1, &["net.safetensors", "bundled:ffdnet_gray"]);
+    fs::remove_file(at("same.safetensors")).unwrap();
     let large = ffdnet(false).state().into_iter().map(|(name, t)| (name, t.affine(1.0, 1e5).unwrap())).collect();
     write_safetensors(&at("large.safetensors"), &large, Storage::F32).unwrap();
     let run = bench.sci(&["weights", "convert", "large.safetensors", "no.safetensors", "--half"]);

@@ -458,3 +458,24 @@ fn lowers_the_noise<N: Network + Denoiser>(name: &str, net: &mut N) {
     let (before, after) = (error(&noisy), error(&denoised));
     assert!(after < 0.1 * before, "{name}: {before:e} {after:e}");
 }
+
+#[test]
+fn a_blend_is_a_share_of_the_way() {
+    let folder = tempfile::tempdir().unwrap();
+    let [from, to, out] = ["from", "to", "out"].map(|name| folder.path().join(format!("{name}.safetensors")));
+    let spec = FfdnetSpec { width: 4, depth: 3, ..FfdnetSpec::GRAY };
+    let nets = [1, 2].map(|seed| Ffdnet::random(spec, seed).unwrap());
+    write_safetensors(&from, &nets[0].state(), Storage::F32).unwrap();
+    write_safetensors(&to, &nets[1].state(), Storage::F32).unwrap();
+    nets::weights::blend(&from, &to, 0.25, &out, Storage::F32).unwrap();
+    let values = |state: std::collections::BTreeMap<String, Tensor>| -> Vec<f32> {
+        state.into_values().flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap()).collect()
+    };
+    let [a, b] = nets.each_ref().map(|net| values(net.state()));
+    let found = values(nets::WeightFile::read(&out).unwrap().into_tensors());
+    assert!(
+        !found.is_empty()
+            && found.iter().zip(a.iter().zip(&b)).all(|(c, (a, b))| (0.75 * a + 0.25 * b - c).abs() < 1e-6)
+    );
+    assert!(nets::weights::blend(&from, &to, 1.5, &out, Storage::F32).is_err());
+}

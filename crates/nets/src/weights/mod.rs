@@ -139,14 +139,47 @@ impl WeightFile {
 /// # Errors
 /// When the input cannot be read as the weights of a known network, or the output cannot be written.
 pub fn convert(input: &Path, output: &Path, fold_batch_norm: bool, storage: Storage) -> Result<()> {
-    if output.extension().is_none_or(|e| e != "safetensors") {
-        return Err(Error::format(output, "weights are written as .safetensors only: give the file that extension"));
-    }
+    only_safetensors(output)?;
     let mut net = Architecture::load(WeightFile::read(input)?, Ends::Circular)?;
     if fold_batch_norm {
         net.fold_batch_norm()?;
     }
     write_safetensors(output, &net.state(), storage)
+}
+
+/// Writes weights that are a share of the way from some to others of the same network: a network that has learned something new has often lost a
+/// little of the old, and most of the way has most of both.
+///
+/// # Errors
+/// When a file cannot be read, the networks differ, the share is not from 0 to 1, or the output cannot be written.
+///
+/// # References
+/// Wortsman et al., *Robust fine-tuning of zero-shot models*, CVPR 2022.
+pub fn blend(from: &Path, to: &Path, share: f64, output: &Path, storage: Storage) -> Result<()> {
+    if !(0.0..=1.0).contains(&share) {
+        let legal = "0 to 1".to_owned();
+        return Err(Error::Setting { key: "share", value: share.to_string(), legal });
+    }
+    only_safetensors(output)?;
+    let state = |path: &Path| Ok::<_, Error>(Architecture::load(WeightFile::read(path)?, Ends::Circular)?.state());
+    let (state, other) = (state(from)?, state(to)?);
+    if state.len() != other.len() {
+        return Err(Error::format(to, format!("is of another network than {}", from.display())));
+    }
+    let part = |(name, from_tensor): (String, Tensor)| {
+        let to_tensor = other.get(&name).filter(|to| to.dims() == from_tensor.dims());
+        let to_tensor =
+            to_tensor.ok_or_else(|| Error::format(to, format!("has no {name} like that of {}", from.display())))?;
+        Ok((name, (from_tensor.affine(1.0 - share, 0.0)? + to_tensor.affine(share, 0.0)?)?))
+    };
+    write_safetensors(output, &state.into_iter().map(part).collect::<Result<_>>()?, storage)
+}
+
+fn only_safetensors(output: &Path) -> Result<()> {
+    if output.extension().is_none_or(|e| e != "safetensors") {
+        return Err(Error::format(output, "weights are written as .safetensors only: give the file that extension"));
+    }
+    Ok(())
 }
 
 /// How [`write_safetensors`] stores numbers.

@@ -28,6 +28,20 @@ pub(super) enum Command {
         #[arg(long)]
         half: bool,
     },
+    /// Write weights that are a share of the way from some to others of the same network, which have most of what both know
+    Blend {
+        /// Where the way begins: a .pth or .safetensors file, or bundled:NAME
+        from: PathBuf,
+        /// Where it ends
+        to: PathBuf,
+        /// 0 to 1
+        share: f64,
+        /// The .safetensors file to write
+        output: PathBuf,
+        /// Store 16 bits a number
+        #[arg(long)]
+        half: bool,
+    },
 }
 
 impl Command {
@@ -35,13 +49,20 @@ impl Command {
         match self {
             Self::Inspect { file } => inspect(&file)?,
             Self::Convert { input, output, fold, half } => {
-                let storage = if half { Storage::F16 } else { Storage::F32 };
-                weights::convert(&input, &output, fold, storage)?;
+                weights::convert(&input, &output, fold, storage(half))?;
+                outln!("{}", output.display());
+            }
+            Self::Blend { from, to, share, output, half } => {
+                weights::blend(&from, &to, share, &output, storage(half))?;
                 outln!("{}", output.display());
             }
         }
         Ok(Done::Complete)
     }
+}
+
+fn storage(half: bool) -> Storage {
+    if half { Storage::F16 } else { Storage::F32 }
 }
 
 fn inspect(file: &Path) -> anyhow::Result<()> {
