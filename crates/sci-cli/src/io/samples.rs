@@ -277,7 +277,10 @@ impl Array {
     ///
     /// # Panics
     /// If there is no part, or they do not fit together.
-    pub fn joined(parts: &[Self], axis: usize) -> Self {
+    pub fn joined(mut parts: Vec<Self>, axis: usize) -> Self {
+        if parts.len() == 1 {
+            return parts.remove(0);
+        }
         let first = &parts[0];
         let outer: usize = first.shape[..axis].iter().product();
         let inner: usize = first.shape[axis + 1..].iter().product();

@@ -233,13 +233,13 @@ impl Banded {
     fn part(&self, chosen: &[usize], rows: &[Range<usize>]) -> Result<Scene, SceneError> {
         let read = |part: &Part, frames: Range<usize>| -> Result<Array, SceneError> {
             let blocks = rows.iter().map(|rows| part.read(frames.clone(), rows.clone()));
-            Ok(Array::joined(&blocks.collect::<Result<Vec<_>, _>>()?, part.axes.row))
+            Ok(Array::joined(blocks.collect::<Result<Vec<_>, _>>()?, part.axes.row))
         };
         let mask = Some(read(&self.mask, 0..self.shape.frames)?);
         let meas = |part: &Part| match (part.axes.frame, chosen) {
             (Some(axis), [_, _, ..]) => {
                 let all = chosen.iter().map(|&k| read(part, k..k + 1)).collect::<Result<Vec<_>, _>>()?;
-                Ok::<_, SceneError>(Array::joined(&all, axis))
+                Ok::<_, SceneError>(Array::joined(all, axis))
             }
             _ => read(part, chosen[0]..chosen[0] + 1),
         };

@@ -48,7 +48,7 @@ pub struct Decided {
 
 impl Default for Decided {
     fn default() -> Self {
-        Self { least_open: 0.0, open: 1.0, truth: 1.0, meas: 1.0, clip: None, unit: 1.0 }
+        Self { open: 1.0, truth: 1.0, meas: 1.0, clip: None, unit: 1.0, least_open: 0.0 }
     }
 }
 
@@ -332,8 +332,8 @@ fn close_hardly_open(mask: &mut Array3<f32>, is_decided: bool, decided: &mut Dec
     let hardly = open.mapv(|open| open > 0.0 && open < decided.least_open);
     let count = hardly.iter().filter(|&&hardly| hardly).count();
     if count > 0 {
-        mask.outer_iter_mut()
-            .for_each(|mut mask| mask.zip_mut_with(&hardly, |c, &hardly| *c *= f32::from(u8::from(!hardly))));
+        let close = |c: &mut f32, hardly: &bool| *c = if *hardly { 0.0 } else { *c };
+        mask.outer_iter_mut().for_each(|mut mask| mask.zip_mut_with(&hardly, close));
         notes.push(format!("{count} pixels that masks open for less than 1 % of the usual count as not measured"));
     }
 }
