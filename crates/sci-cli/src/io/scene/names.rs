@@ -81,7 +81,10 @@ pub(super) fn suggestion(key: &str, present: &[String], own: &Keys) -> Option<St
         .find(|(own, others)| own.as_str() == lower || others.contains(&lower.as_str()))
         .map_or((key, &[][..]), |(own, others)| (own.as_str(), others));
     let distance = |name: &&String| strsim::damerau_levenshtein(&name.to_ascii_lowercase(), &lower);
-    let close = || present.iter().min_by_key(distance).filter(|name| distance(name) <= 2);
+    // What plays one part is not meant by another.
+    let plays = |name: &str| Keys::default().all().contains(&name);
+    let meant = |name: &&String| !(plays(key) && plays(name));
+    let close = || present.iter().filter(meant).min_by_key(distance).filter(|name| distance(name) <= 2);
     name_of(own, own, others, present).or_else(|| close().cloned())
 }
 
@@ -121,5 +124,6 @@ mod tests {
         assert_eq!(suggestion("maks", &there, &Keys::default()).as_deref(), Some("mask"));
         assert_eq!(suggestion("mask", &names(&["a", "Phi"]), &Keys::default()).as_deref(), Some("Phi"));
         assert_eq!(suggestion("mask", &names(&["depth"]), &Keys::default()), None);
+        assert_eq!(suggestion("meas", &names(&["mask"]), &Keys::default()), None);
     }
 }
