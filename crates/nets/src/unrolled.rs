@@ -156,7 +156,7 @@ impl Recipe {
         Ok((stop != StopReason::Diverged).then_some(result))
     }
 
-    /// What the denoiser is given in these calls (in order, counted from 0); in fewer where they diverge.
+    /// What the denoiser is given in these calls (in order, counted from 0); nothing where the solve diverges before the last.
     ///
     /// # Errors
     /// As [`Recipe::solve`].
@@ -165,11 +165,11 @@ impl Recipe {
         measurement: &Measurement,
         denoiser: &mut dyn Denoiser,
         calls: Vec<usize>,
-    ) -> Result<Vec<RecordedCall>> {
+    ) -> Result<Option<Vec<RecordedCall>>> {
         let count = calls.last().map_or(0, |last| last + 1);
         let mut recorder = Recorder { denoiser: self.turning(denoiser), calls, seen: Vec::new() };
         self.solve_calls(measurement, Box::new(&mut recorder), count)?;
-        Ok(recorder.seen)
+        Ok((recorder.seen.len() == recorder.calls.len()).then_some(recorder.seen))
     }
 
     fn turning<'d>(&self, denoiser: &'d mut dyn Denoiser) -> Box<dyn Denoiser + 'd> {
@@ -450,7 +450,7 @@ mod tests {
 
         let loss_at = |net: &mut Ffdnet| -> f64 {
             let mut seen = Vec::new();
-            for call in recipe.record(&measurement, net, vec![0, 1, 2]).unwrap() {
+            for call in recipe.record(&measurement, net, vec![0, 1, 2]).unwrap().unwrap() {
                 let v = recipe.denoised(net, &tensor(call.input.clone()).unwrap(), &call).unwrap();
                 let v = v.flatten_all().unwrap().to_vec1::<f32>().unwrap();
                 let squares = v.iter().zip(&clip).map(|(v, clean)| f64::from(v - clean).powi(2));
@@ -458,7 +458,7 @@ mod tests {
             }
             (seen[0] + 2.0 * seen[1] + 4.0 * seen[2]) / 7.0
         };
-        let calls = recipe.record(&measurement, &mut net, vec![0, 1, 2]).unwrap();
+        let calls = recipe.record(&measurement, &mut net, vec![0, 1, 2]).unwrap().unwrap();
         assert_eq!((calls.len(), calls[0].input.len_of(Axis(0))), (3, 3));
         let before = loss_at(&mut net);
         let found = recipe.gradient(&measurement, &calls, &net, &vars, &squared).unwrap();

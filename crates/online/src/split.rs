@@ -384,13 +384,11 @@ impl<'c, N: Network + Denoiser + Clone> Learner<'c, N> {
             let scene = &scenes[rng.random_range(0..scenes.len())];
             let hide = |judge: bool, u: f64| !judge && u < config.hidden;
             let Some(crop) = scene.crop(config.side, &mut rng, hide) else { return Ok(None) };
-            let calls: Vec<usize> = (first..recipe.sigmas.len()).collect();
-            let count = calls.len();
-            let calls = recipe.record(&crop.given, &mut now.clone(), calls)?;
-            if calls.len() < count {
-                // The solve was given up: a loss that is no number ends the updates.
+            let calls = (first..recipe.sigmas.len()).collect();
+            let Some(calls) = recipe.record(&crop.given, &mut now.clone(), calls)? else {
+                // A loss that is no number ends the updates.
                 return Ok(Some(Gradients { loss: f32::NAN, of_vars: Vec::new() }));
-            }
+            };
             Ok(Some(recipe.gradient(&crop.given, &calls, &self.net, &self.vars, &|v| Ok(crop.loss(v)?))?))
         };
         let lessons = (0..config.crops).into_par_iter().map(lesson).collect::<Result<Vec<_>>>()?;

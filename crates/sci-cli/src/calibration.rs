@@ -15,6 +15,8 @@ use crate::io::read_file;
 use crate::io::scene::field::median;
 use crate::io::scene::{HARDLY_OPEN, Scene};
 
+/// What it is called in the folder that `sci calibrate` writes.
+pub const FILE: &str = "calibration.json";
 /// The version of the file.
 const SCHEMA: u32 = 1;
 /// Measurements that are looked at, at most: each makes every try so much longer.

@@ -38,7 +38,7 @@ impl IteratesConfig {
     }
 
     /// What the solver gives the denoiser in some of the calls of a solve, drawn anew: of [`Self::unrolled`] ones consecutive calls. Iterates
-    /// of one clip are much alike, so that few of many clips teach more than all of few.
+    /// of one clip are much alike, so that few of many clips teach more than all of few. Nothing where the solve diverges.
     ///
     /// # Errors
     /// That of the network.
@@ -47,7 +47,7 @@ impl IteratesConfig {
         measurement: &Measurement,
         denoiser: &mut dyn Denoiser,
         rng: &mut impl Rng,
-    ) -> Result<Vec<RecordedCall>> {
+    ) -> Result<Option<Vec<RecordedCall>>> {
         let calls = if self.unrolled {
             let first = rng.random_range(0..=self.sigmas.len() - self.calls);
             (first..first + self.calls).collect()
@@ -146,11 +146,11 @@ mod tests {
         let measurement = camera::plain(clip.view(), CfaPattern::Rggb, 0.0, rng).unwrap();
         let (mut other, mut trained) = (settings.load_first(1).unwrap().unwrap(), other_network());
         let mut both = settings.relay(Some(&*other), &mut trained);
-        let seen = settings.record(&measurement, &mut both, rng).unwrap();
+        let seen = settings.record(&measurement, &mut both, rng).unwrap().unwrap();
         assert_eq!(seen.iter().map(|call| call.iteration).collect::<Vec<_>>(), [2, 3]);
         // What the trained one is given first is the other's work alone, what it is given then is not.
         let mut alone = settings.relay(None, &mut *other);
-        let by_other = settings.recipe().record(&measurement, &mut alone, vec![2, 3]).unwrap();
+        let by_other = settings.recipe().record(&measurement, &mut alone, vec![2, 3]).unwrap().unwrap();
         assert_eq!(seen[0].input, by_other[0].input);
         assert_ne!(seen[1].input, by_other[1].input);
         assert!(settings.load_first(3).err().unwrap().to_string().contains("iterates.first.weights"));

@@ -250,11 +250,8 @@ impl Trainer {
             let measurement = camera::measure(clip.view(), pattern, self.camera(), &mut rng)?;
             let mut model = model.boxed();
             let mut denoiser = settings.relay(self.first.as_deref(), &mut *model);
-            let calls = settings.record(&measurement, &mut denoiser, &mut rng)?;
-            if calls.len() < settings.calls {
-                // The solve was given up.
-                return Err(Error::Diverged { step: self.step + 1, loss: f32::NAN });
-            }
+            let diverged = Error::Diverged { step: self.step + 1, loss: f32::NAN };
+            let calls = settings.record(&measurement, &mut denoiser, &mut rng)?.ok_or(diverged)?;
             if settings.unrolled {
                 return Ok(vec![Lesson::Unrolled { measurement: Box::new(measurement), clean: clip, calls }]);
             }

@@ -49,11 +49,12 @@ impl Args {
         refuse_inputs(&out, &experiment.inputs())?;
         check_folder(&out)?;
         if let Some(foreign) = FILES.map(|name| out.join(name)).iter().find(|file| file.exists())
-            && !out.join(JSON).exists()
+            && !out.join(calibration::FILE).exists()
         {
             anyhow::bail!(UsageError(format!(
-                "--out: {} is there, but no {JSON} with it: it is not of a calibration and would be replaced; name another folder",
-                foreign.display()
+                "--out: {} is there, but no {} with it: it is not of a calibration and would be replaced; name another folder",
+                foreign.display(),
+                calibration::FILE
             )));
         }
         catch_interrupts()?;
@@ -72,20 +73,19 @@ impl Args {
         draw(&mut svg, &found).map_err(|e| anyhow!("cannot draw the curves: {e}"))?;
         write_atomically(&out.join(FILES[1]), |w| w.write_all(svg.as_bytes()))?;
         // Last: where it is, the others are.
-        write_atomically(&out.join(JSON), |w| w.write_all(found.to_json().as_bytes()))?;
+        write_atomically(&out.join(calibration::FILE), |w| w.write_all(found.to_json().as_bytes()))?;
         found.lines().iter().for_each(|line| outln!("{line}"));
         found.apply(&mut scene)?;
         scene.look_for_defects(experiment.data.reading.defects)?.iter().for_each(|note| say(&experiment, note));
         let Calibration { error_before, error_after, solves, .. } = found;
         outln!("held-out error {error_before:.3e} -> {error_after:.3e} after {solves} tries");
-        outln!("wrote {0}; use it by --set data.calibration={0}/{JSON}", out.display());
+        outln!("wrote {0}; use it by --set data.calibration={0}/{1}", out.display(), calibration::FILE);
         Ok(Done::Complete)
     }
 }
 
-/// What is written beside [`JSON`].
+/// What is written beside [`calibration::FILE`].
 const FILES: [&str; 2] = ["masks.npy", "calibration.svg"];
-const JSON: &str = "calibration.json";
 
 const COLUMNS: usize = 3;
 const CELL: (u32, u32) = (320, 240);

@@ -6,6 +6,7 @@ use sci_forward::{CfaPattern, Noise};
 use serde_json::json;
 
 use super::camera;
+use crate::calibration;
 use crate::io::defects::Defects;
 use crate::io::raw::{Packing, Raw};
 use crate::io::scene::{Axes, Clip, Keys, MaskShift, Reading, Sensor, SensorNoise};
@@ -201,7 +202,7 @@ fn calibration(t: &mut Table<'_>) -> Calibration {
     }
     let path = t.path("calibration");
     // The folder that `sci calibrate` wrote it to means it.
-    Calibration::File(if path.is_dir() { path.join("calibration.json") } else { path })
+    Calibration::File(if path.is_dir() { path.join(calibration::FILE) } else { path })
 }
 
 fn part_names(t: &mut Table<'_>) -> Keys {

@@ -8,7 +8,7 @@ use crate::calibration::Calibration;
 use crate::config::Experiment;
 use crate::factory::Factory;
 use crate::record::Record;
-use crate::run_folder::{Finished, Layout, RunFolder};
+use crate::run_folder::{Layout, RunFolder};
 use crate::shard::Shard;
 use crate::solve;
 
@@ -72,8 +72,12 @@ impl Ending<'_> {
     }
 
     fn is_complete(&self, folder: &RunFolder) -> bool {
-        let solved = folder.finished();
-        solved.len() == self.count && solved.iter().all(Finished::is_whole)
+        self.unsolved(folder) == 0
+    }
+
+    /// How many measurements are not solved to their end.
+    fn unsolved(&self, folder: &RunFolder) -> usize {
+        self.count - folder.finished().iter().filter(|finished| finished.is_whole()).count()
     }
 
     /// The record of what is solved.
@@ -82,7 +86,7 @@ impl Ending<'_> {
         let indices: Vec<usize> = measurements.iter().map(|m| m.index).collect();
         let (files, calibration) = (self.layout.files(&indices), self.calibration.clone());
         let record = solve::record(self.experiment, self.factory, measurements, files, calibration, self.begin)?;
-        let unsolved = self.count - folder.finished().iter().filter(|f| f.is_whole()).count();
-        Ok(Record { checksums: self.checksums.clone(), warnings: self.warnings.clone(), unsolved, ..record })
+        let (checksums, warnings) = (self.checksums.clone(), self.warnings.clone());
+        Ok(Record { checksums, warnings, unsolved: self.unsolved(folder), ..record })
     }
 }

@@ -340,8 +340,8 @@ impl Banded {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array3;
-    use ndarray_npy::NpzWriter;
+    use ndarray::{Array, Array3, Array4, Dimension};
+    use ndarray_npy::{NpzWriter, WritableElement};
 
     /// A scene of bytes whose masks have this shape, and the folder that it is in.
     fn scene(masks: [usize; 3], frames: usize) -> (tempfile::TempDir, std::path::PathBuf) {
@@ -351,6 +351,22 @@ mod tests {
         npz.add_array("mask", &Array3::<u8>::ones(masks)).unwrap();
         let video = Array3::from_shape_fn((frames, masks[1], masks[2]), |(t, y, x)| (t + 5 * y + x) as u8);
         npz.add_array("orig", &video).unwrap();
+        npz.finish().unwrap();
+        (dir, path)
+    }
+
+    /// A folder with a scene of these masks and measurements.
+    fn measured<A: WritableElement, B: WritableElement>(
+        mask: &Array<A, impl Dimension>,
+        meas: &Array3<B>,
+        compressed: bool,
+    ) -> (tempfile::TempDir, std::path::PathBuf) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.npz");
+        let file = std::fs::File::create(&path).unwrap();
+        let mut npz = if compressed { NpzWriter::new_compressed(file) } else { NpzWriter::new(file) };
+        npz.add_array("mask", mask).unwrap();
+        npz.add_array("meas", meas).unwrap();
         npz.finish().unwrap();
         (dir, path)
     }
@@ -376,13 +392,9 @@ mod tests {
     /// y without its masks is scaled as in a band, whatever it came in.
     #[test]
     fn a_whole_y_is_that_of_the_bands() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.npz");
-        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
-        npz.add_array("mask", &Array3::from_shape_fn((4, 20, 6), |(t, y, x)| ((t + y + x) % 2) as u8)).unwrap();
+        let mask = Array3::from_shape_fn((4, 20, 6), |(t, y, x)| ((t + y + x) % 2) as u8);
         let y = Array3::from_shape_fn((2, 20, 6), |(k, y, x)| (100 + 40 * k + 7 * y + 11 * x) as u16);
-        npz.add_array("meas", &y).unwrap();
-        npz.finish().unwrap();
+        let (_dir, path) = measured(&mask, &y, false);
         let mut reading = Reading::default();
         reading.sensor.black = 64.0;
         let mut banded = Banded::open(&path, &reading).unwrap().unwrap();
@@ -405,13 +417,10 @@ mod tests {
     /// Sky at the top is bright, which the rows in the middle do not show.
     #[test]
     fn what_numbers_mean_is_decided_by_rows_from_all_over() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.npz");
-        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
-        npz.add_array("mask", &Array3::from_shape_fn((4, 320, 6), |(t, y, x)| ((t + y + x) % 2) as u8)).unwrap();
+        let mask = Array3::from_shape_fn((4, 320, 6), |(t, y, x)| ((t + y + x) % 2) as u8);
         let light = |y: usize| if y < 60 { 3000 } else { 200 };
-        npz.add_array("meas", &Array3::from_shape_fn((1, 320, 6), |(_, y, x)| (light(y) + x) as u16)).unwrap();
-        npz.finish().unwrap();
+        let y = Array3::from_shape_fn((1, 320, 6), |(_, y, x)| (light(y) + x) as u16);
+        let (_dir, path) = measured(&mask, &y, false);
         let whole = super::super::read(&path, &Reading::default()).unwrap();
         let mut banded = Banded::open(&path, &Reading::default()).unwrap().unwrap();
         banded.decide(64).unwrap();
@@ -422,13 +431,9 @@ mod tests {
 
     #[test]
     fn hot_pixels_are_told_by_another_measurement() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.npz");
-        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
-        npz.add_array("mask", &Array3::from_shape_fn((4, 48, 16), |(t, y, x)| ((t + y + x) % 2) as f32)).unwrap();
+        let mask = Array3::from_shape_fn((4, 48, 16), |(t, y, x)| ((t + y + x) % 2) as f32);
         let hot = |y: usize, x: usize| if (y, x) == (21, 7) { 2.0 } else { 0.6 };
-        npz.add_array("meas", &Array3::from_shape_fn((2, 48, 16), |(_, y, x)| hot(y, x))).unwrap();
-        npz.finish().unwrap();
+        let (_dir, path) = measured(&mask, &Array3::from_shape_fn((2, 48, 16), |(_, y, x)| hot(y, x)), false);
         let reading = Reading { defects: Defects::Exclude, scale: Some(1.0), ..Reading::default() };
         let mut banded = Banded::open(&path, &reading).unwrap().unwrap();
         banded.decide(32).unwrap();
@@ -440,17 +445,12 @@ mod tests {
 
     #[test]
     fn a_packed_member_is_checked_to_its_end() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.npz");
-        let mut npz = NpzWriter::new_compressed(std::fs::File::create(&path).unwrap());
         let mut state = 1u32;
         let noise = Array3::from_shape_simple_fn((2, 64, 64), || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 24) as u8
         });
-        npz.add_array("mask", &noise).unwrap();
-        npz.add_array("meas", &Array3::<u8>::ones((1, 64, 64))).unwrap();
-        npz.finish().unwrap();
+        let (dir, path) = measured(&noise, &Array3::<u8>::ones((1, 64, 64)), true);
         let mut bytes = std::fs::read(&path).unwrap();
         let unpacked = |bytes: &[u8]| {
             std::fs::write(&path, bytes).unwrap();
@@ -463,12 +463,7 @@ mod tests {
 
     #[test]
     fn shapes_that_are_not_plain_are_read_whole() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("scene.npz");
-        let mut npz = NpzWriter::new(std::fs::File::create(&path).unwrap());
-        npz.add_array("mask", &ndarray::Array4::<u8>::ones((1, 3, 8, 8))).unwrap();
-        npz.add_array("meas", &Array3::<u8>::ones((1, 8, 8))).unwrap();
-        npz.finish().unwrap();
+        let (_dir, path) = measured(&Array4::<u8>::ones((1, 3, 8, 8)), &Array3::<u8>::ones((1, 8, 8)), false);
         assert!(Banded::open(&path, &Reading::default()).unwrap().is_none());
     }
 }

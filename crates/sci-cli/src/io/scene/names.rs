@@ -43,30 +43,22 @@ pub(super) fn resolved(keys: &Keys, names: &[String]) -> Keys {
     }
 }
 
+/// The parts in the order of [`Keys::all`]: their own names, which are those of their keys in `data.keys` too, and what they are.
+const PARTS: [(&str, &str); 4] =
+    [("mask", "the masks"), ("meas", "the measurements"), ("orig", "the truth"), ("rgb", "the truth in color")];
+
 /// A name that the experiment gives to a part and a file lacks, and the part: to go on with another would be to solve something else.
 pub(super) fn lacking<'k>(keys: &'k Keys, names: &[String], masks_elsewhere: bool) -> Option<(&'k str, &'static str)> {
-    let own = Keys::default();
-    let parts = [
-        (&keys.mask, own.mask, "the masks"),
-        (&keys.meas, own.meas, "the measurements"),
-        (&keys.orig, own.orig, "the truth"),
-        (&keys.rgb, own.rgb, "the truth in color"),
-    ];
-    let mut given = parts.into_iter().skip(usize::from(masks_elsewhere)).filter(|(key, own, _)| *key != own);
-    given.find(|(key, ..)| !names.contains(key)).map(|(key, _, part)| (key.as_str(), part))
+    let parts = keys.all().into_iter().zip(PARTS).skip(usize::from(masks_elsewhere));
+    let mut given = parts.filter(|(key, (own, _))| key != own);
+    given.find(|(key, _)| !names.iter().any(|name| name == key)).map(|(key, (_, what))| (key, what))
 }
 
 /// What is to be said about names that were found in the place of others.
 pub(super) fn notes(keys: &Keys, found: &Keys) -> Vec<String> {
-    let parts = [
-        (&keys.mask, &found.mask, "mask", "the masks"),
-        (&keys.meas, &found.meas, "meas", "the measurements"),
-        (&keys.orig, &found.orig, "orig", "the truth"),
-        (&keys.rgb, &found.rgb, "rgb", "the truth in color"),
-    ];
-    let renamed = parts.into_iter().filter(|(key, found, ..)| key != found);
+    let renamed = keys.all().into_iter().zip(found.all()).zip(PARTS).filter(|((key, found), _)| key != found);
     renamed
-        .map(|(key, found, part, what)| {
+        .map(|((key, found), (part, what))| {
             format!("there is no `{key}`: `{found}` is taken for {what}; data.keys.{part} names another")
         })
         .collect()
@@ -82,7 +74,7 @@ pub(super) fn suggestion(key: &str, present: &[String], own: &Keys) -> Option<St
         .map_or((key, &[][..]), |(own, others)| (own.as_str(), others));
     let distance = |name: &&String| strsim::damerau_levenshtein(&name.to_ascii_lowercase(), &lower);
     // What plays one part is not meant by another.
-    let plays = |name: &str| Keys::default().all().contains(&name);
+    let plays = |name: &str| PARTS.iter().any(|(own, _)| *own == name);
     let meant = |name: &&String| !(plays(key) && plays(name));
     let close = || present.iter().filter(meant).min_by_key(distance).filter(|name| distance(name) <= 2);
     name_of(own, own, others, present).or_else(|| close().cloned())

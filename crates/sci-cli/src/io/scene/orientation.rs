@@ -10,17 +10,12 @@ const MEANT: f32 = 0.3;
 /// What is to be said of masks with the sum `open` that do not go with a measurement, but would if they were turned; nothing if they go, or if
 /// nothing tells. `lattice` is the distance of pixels of one color.
 pub(super) fn doubt(open: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, lattice: usize) -> Option<String> {
-    let y = fine(y, lattice)?;
-    let with = |open: ArrayView2<'_, f32>| correlation(fine(open, lattice)?.view(), y.view());
-    let told = with(open)?;
-    if y.len() < FEWEST || told >= TOGETHER {
-        return None;
-    }
-    let elsewhere = elsewhere(&fine(open, lattice)?, &y);
-    let turned = (0..8).filter_map(|turn| {
-        let turned = turned(open, turn);
-        Some((turn, with(turned)?))
-    });
+    let y = fine(y, lattice).filter(|y| y.len() >= FEWEST)?;
+    let open = fine(open, lattice)?;
+    let told = correlation(open.view(), y.view()).filter(|&told| told < TOGETHER)?;
+    let elsewhere = elsewhere(&open, &y);
+    // The differences of a turned picture are the turned differences.
+    let turned = (0..8).filter_map(|turn| Some((turn, correlation(turned(open.view(), turn), y.view())?)));
     let (turn, found) = turned.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))?;
     (found.abs() >= MEANT.max(elsewhere)).then(|| {
         let how = HOW.iter().enumerate().filter(|(bit, _)| turn >> bit & 1 == 1).map(|(_, how)| *how);
